@@ -1,0 +1,1 @@
+"""The Implicit LiDAR Network (ICRA 2022): sensors, scans, towns, models, training and evaluation."""

@@ -1,0 +1,1 @@
+"""Warp ops for torch tensors: rays, neighbours, and the fused blend of the Implicit LiDAR Network."""
