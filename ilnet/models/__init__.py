@@ -1,0 +1,86 @@
+"""The models by name, made untrained or loaded from a file of weights."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+
+from ilnet.models.base import Model
+from ilnet.models.bilinear import Bilinear, Nearest
+from ilnet.models.iln import ILN
+
+__all__ = ["ILN", "NAMES", "TRAINABLE", "Bilinear", "Model", "Nearest", "create", "load", "save"]
+
+# What `iln-prior` adds to the paper's network was chosen on scans held out of the training towns.
+_MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
+    "nearest": (Nearest, {}),
+    "bilinear": (Bilinear, {}),
+    "bilinear-inverse": (Bilinear, {"inverse": True}),
+    "iln": (ILN, {}),
+    "iln-prior": (ILN, {"prior": "bilinear"}),
+}
+NAMES = tuple(_MODELS)
+TRAINABLE = tuple(name for name, (kind, _) in _MODELS.items() if kind is ILN)
+
+_SHIPPED = Path(__file__).parents[1] / "weights"
+
+
+def create(name: str, **arguments: Any) -> Model:
+    """Makes an untrained model.
+
+    Args:
+        name: One of `NAMES`.
+        **arguments: The constructor's; they override what the name stands for.
+
+    Raises:
+        ValueError: If there is no such model.
+    """
+    if name not in _MODELS:
+        raise ValueError(f"unknown model {name!r}; known are {', '.join(NAMES)}")
+    kind, defaults = _MODELS[name]
+    return kind(**{**defaults, **arguments})
+
+
+def save(model: Model, path: str | Path, name: str, arguments: dict[str, Any], **card: Any) -> None:
+    """Writes weights with all that is needed to make the model again.
+
+    Args:
+        model: Whose weights are written.
+        path: A `.safetensors` file; its folder is made.
+        name: One of `NAMES`.
+        arguments: The constructor's arguments that differ from what the name stands for.
+        **card: How it was trained; JSON values.
+    """
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    about = {"name": name, "arguments": arguments, **card}
+    weights = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
+    save_file(weights, path, {key: json.dumps(value) for key, value in about.items()})
+
+
+def load(name: str | Path) -> Model:
+    """Loads a trained model, ready to predict.
+
+    Args:
+        name: One of `NAMES`, for the weights that ship with the package, or a file that `save` wrote.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is neither a name nor a file of weights.
+    """
+    if name in NAMES and name not in TRAINABLE:
+        return create(str(name)).eval()
+    path = _SHIPPED / f"{name}.safetensors" if name in NAMES else Path(name)
+    if not path.is_file():
+        if path.suffix != ".safetensors":
+            raise ValueError(f"unknown model {str(name)!r}; known are {', '.join(NAMES)}, or a .safetensors file")
+        raise FileNotFoundError(f"{path}: no such file of weights")
+    try:
+        with safe_open(path, "pt") as file:
+            about = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
+        model = create(about["name"], **about["arguments"])
+        model.load_state_dict(load_file(path))
+    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{path}: not weights that `python -m ilnet train` wrote ({error})") from error
+    return model.eval()

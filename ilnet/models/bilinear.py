@@ -1,0 +1,31 @@
+"""Baselines without parameters: the nearest pixel, and the paper's bilinear interpolation in two spaces."""
+
+import torch
+
+from ilnet.models.base import Model
+from kernels import gather_blend
+
+__all__ = ["Bilinear", "Nearest"]
+
+
+class Nearest(Model):
+    """The range of the pixel nearest to the query."""
+
+    def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+        # A query moved onto a pixel centre has that pixel as its only neighbour with an area.
+        return gather_blend(image, queries.round(), queries.new_zeros(*queries.shape[:-1], 4), "bilinear", wrap)
+
+
+class Bilinear(Model):
+    """The neighbours' ranges weighted by area (paper, Eq. 2 with measured values), or their inverse ranges.
+
+    Args:
+        inverse: Whether inverse ranges are interpolated, which keeps planes flat.
+    """
+
+    def __init__(self, inverse: bool = False):
+        super().__init__()
+        self.prior = "perspective" if inverse else "bilinear"
+
+    def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+        return gather_blend(image, queries, queries.new_zeros(*queries.shape[:-1], 4), self.prior, wrap)

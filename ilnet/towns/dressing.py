@@ -1,0 +1,196 @@
+"""What lines the streets and stands on them: lamps, trees, signs, parked cars, traffic, people, wires."""
+
+import numpy as np
+
+from ilnet.towns import furniture, plants, vehicles
+from ilnet.towns.parts import Part
+from ilnet.towns.site import Site
+from ilnet.towns.streets import Street
+
+__all__ = ["dress_street", "greenery", "plant_fields", "signals", "traffic"]
+
+
+def greenery(rng: np.random.Generator) -> dict[str, list[Part]]:
+    """Prototypes of plants: of the street ("tall"), of gardens ("small"), of the distance ("far"), and others."""
+    return {
+        "tall": [
+            plants.tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 580, (0.2, 0.42), twigs=3)
+            for _ in range(5)
+        ],
+        "small": [
+            plants.tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 420, (0.15, 0.35)) for _ in range(4)
+        ],
+        "bare": [plants.tree(rng, rng.uniform(7, 10), rng.uniform(2.2, 3.0), 3.3, 0, (0, 0)) for _ in range(2)],
+        "conifer": [plants.conifer(rng, rng.uniform(6, 11), 520) for _ in range(2)],
+        "bush": [plants.bush(rng, rng.uniform(0.6, 1.1), 130) for _ in range(4)],
+        "far": [
+            plants.tree(rng, rng.uniform(9, 14), rng.uniform(3.2, 4.5), 1.5, 270, (0.5, 0.9), twigs=0) for _ in range(3)
+        ],
+    }
+
+
+def _pick(parts: list[Part], rng: np.random.Generator) -> Part:
+    return parts[int(rng.integers(0, len(parts)))]
+
+
+def _spread(street: Street, right: float, first: float, step: float, jitter: float, rng: np.random.Generator):
+    """Stations along a street at a lateral offset: points (N, 2) and headings (N,)."""
+    s = np.arange(first, street.length - 2, step)
+    return street.at(s + rng.uniform(-jitter, jitter, len(s)), right)
+
+
+def dress_street(site: Site, street: Street, greens: dict[str, list[Part]], rng: np.random.Generator) -> None:
+    """Furnish both pavements, the kerbside parking and the median of a street."""
+    ground = site.ground
+    open_country = street.frontage == "open"
+    for side in (1, -1):
+        inward = np.pi / 2 if side > 0 else -np.pi / 2  # turn from the heading to face the carriageway
+        lamp = furniture.lamp(rng.uniform(6.0, 8.5), rng.uniform(1.0, 2.2))
+        offset = side * (street.half + 0.5)
+
+        def stand(
+            parts: list[Part], first: float, step: float, share: float, right: float, turn: float, scale=(1.0, 1.0)
+        ):
+            xy, heading = _spread(street, right, first, step, 0.2 * step, rng)
+            edge = ground.edge(xy)
+            keep = (edge > 0.38) & (edge < street.pavement + 0.2) & (rng.random(len(xy)) < share) & ~site.taken(xy)
+            kind = rng.integers(0, len(parts), len(xy))
+            size = rng.uniform(scale[0], scale[1], len(xy))
+            for k, part in enumerate(parts):
+                pick = keep & (kind == k)
+                site.put(part, xy[pick], heading[pick] + turn, size[pick])
+
+        stand([lamp], 9 if side > 0 else 24, 30, 0.95, offset, inward)
+        stand([furniture.sign(k) for k in range(4)], 14, 23, 0.7, offset, np.pi if side > 0 else 0.0)
+        wide = side * (street.half + street.pavement - 0.5)
+        if not open_country:
+            stand([furniture.bin_(False), furniture.bin_(True)], 20, 35, 0.6, wide, inward)
+            people = [furniture.pedestrian(a, b) for a, b in ((0.7, 0.25), (0.5, 0.15), (0.1, 0.05))]
+            for turn in (0.0, np.pi):
+                stand(
+                    people,
+                    6,
+                    26,
+                    0.3,
+                    side * (street.half + rng.uniform(0.9, street.pavement - 0.4)),
+                    turn,
+                    (0.85, 1.08),
+                )
+        if street.frontage in ("shops", "towers"):
+            stand([furniture.bench()], 16, 41, 0.7, wide, inward)
+            stand([furniture.bollard()], 3, 2.2, 0.25, offset, 0.0)
+            stand([vehicles.bicycle()], 12, 9, 0.25, wide, np.pi / 2)
+            stand([furniture.bus_shelter()], 45, 150, 1.0, wide, inward)
+        if street.pavement > 2.4:
+            trees = greens["tall"] * 3 + greens["bare"]
+            stand(trees, 7, rng.uniform(12, 18), 0.75, side * (street.half + 0.9), rng.uniform(0, 6), (0.95, 1.15))
+        if street.parking:
+            _park(site, street, side, rng)
+    if street.median:
+        s = np.arange(4, street.length - 4, 2.0)
+        xy, _ = street.at(s, 0.0)
+        inside = ground.edge(xy) > 0.5
+        s_tree = inside & (np.arange(len(s)) % 6 == 0)
+        for at in xy[s_tree]:
+            site.put(_pick(greens["tall"], rng), at, rng.uniform(0, 6), rng.uniform(1.0, 1.2))
+        hedge = plants.hedge(rng, 2.0, 0.8, 0.9)
+        for k in np.nonzero(inside[:-1] & inside[1:] & (np.arange(len(s) - 1) % 24 < 14))[0]:
+            site.run(hedge, 2.0, xy[k : k + 2])
+    if street.frontage in ("houses", "open", "rows") and rng.random() < 0.8:
+        _power_line(site, street, rng)
+
+
+def _park(site: Site, street: Street, side: int, rng: np.random.Generator) -> None:
+    """Cars and vans along one kerb."""
+    s = np.arange(5, street.length - 5, 6.1) + rng.uniform(-0.4, 0.4)
+    lateral = side * (street.half - 1.08)
+    xy, heading = street.at(s, lateral)
+    busy = rng.random(len(s)) < rng.uniform(0.25, 0.5)
+    for step in (-6.0, -3.0, 0.0, 3.0, 6.0):  # no parking where the kerb turns away: junctions and the ends of streets
+        near, _ = street.at(s + step, lateral)
+        busy &= np.abs(site.ground.edge(near) + 1.08) < 0.3
+    kind = rng.choice(5, len(s), p=[0.36, 0.27, 0.22, 0.11, 0.04])
+    fleet = [vehicles.car(0), vehicles.car(1), vehicles.car(2), vehicles.van(), vehicles.bicycle()]
+    turn = np.where(rng.random(len(s)) < 0.85, 0.0, np.pi) + (0.0 if side > 0 else np.pi) + rng.normal(0, 0.02, len(s))
+    scale = rng.uniform(0.95, 1.05, (len(s), 3)) * (1, 1, 1)
+    for k, part in enumerate(fleet):
+        pick = busy & (kind == k)
+        site.put(part, xy[pick], heading[pick] + turn[pick], scale[pick])
+
+
+def traffic(site: Site, street: Street, share: float, rng: np.random.Generator) -> np.ndarray:
+    """Vehicles standing in the lanes; returns points (N, 2) along their middles, metres."""
+    fleet = [vehicles.car(0), vehicles.car(1), vehicles.car(2), vehicles.van(), vehicles.lorry()]
+    centres = []
+    for lane in street.lanes:
+        for way in (1, -1):
+            s = np.arange(20, street.length - 20, 24.0)
+            s = s[rng.random(len(s)) < share] + rng.uniform(-4, 4)
+            xy, heading = street.at(s, way * lane)
+            for at, yaw in zip(xy, heading, strict=True):
+                kind = int(rng.choice(5, p=[0.3, 0.25, 0.2, 0.15, 0.1]))
+                site.put(fleet[kind], at, yaw if way > 0 else yaw + np.pi)
+                reach = 2.8 if kind == 4 else 0.0
+                centres += [at + step * np.array([np.cos(yaw), np.sin(yaw)]) for step in (-reach, 0.0, reach)]
+    return np.array(centres).reshape(-1, 2)
+
+
+def signals(site: Site, first: Street, second: Street) -> None:
+    """Traffic lights where two streets meet, before the crossing on each approach."""
+    gap = np.linalg.norm(first.line[:, None] - second.line, axis=-1)
+    meet = np.unravel_index(gap.argmin(), gap.shape)
+    for street, other, k in ((first, second, meet[0]), (second, first, meet[1])):
+        middle = street.length * k / (len(street.line) - 1)
+        for way in (1, -1):
+            s = middle - way * (other.half + 4.5)
+            if not 0 < s < street.length:
+                continue
+            xy, heading = street.at(np.array([s]), way * (street.half + 0.5))
+            if site.ground.edge(xy)[0] > 0.3:
+                inward = heading + way * np.pi / 2
+                # the arm reaches over the lanes, its heads face the traffic that waits
+                arm = furniture.traffic_light(street.half - street.lanes[0])
+                site.put(arm, xy, inward)
+
+
+def _power_line(site: Site, street: Street, rng: np.random.Generator) -> None:
+    """Poles along one side with three sagging wires."""
+    side = float(rng.choice([-1, 1]))
+    s = np.arange(6, street.length - 6, rng.uniform(28, 36))
+    xy, heading = street.at(s, side * (street.half + street.pavement - 0.35))
+    keep = (site.ground.edge(xy) > 0.6) & ~site.taken(xy)
+    xy, heading, s = xy[keep], heading[keep], s[keep]
+    site.put(furniture.pole(), xy, heading)
+    top = site.ground.surface(xy)
+    left = np.column_stack([-np.sin(heading), np.cos(heading)])
+    for y in (-1, 0.35, 1):
+        hooks = top + np.column_stack([left * y, np.full(len(s), 8.0)])
+        for k in range(len(s) - 1):
+            if s[k + 1] - s[k] < 50:
+                site.put_at(furniture.wire(hooks[k], hooks[k + 1], rng.uniform(0.3, 0.8)), (0, 0, 0))
+
+
+def _in_sight(site: Site, xy: np.ndarray) -> np.ndarray:
+    """Whether points (N, 2) are within a LiDAR's reach of some street."""
+    road = np.concatenate([street.line[::5] for street in site.ground.streets])
+    return np.linalg.norm(xy[:, None] - road, axis=-1).min(1) < 85
+
+
+def plant_fields(site: Site, greens: dict[str, list[Part]], radius: float, rng: np.random.Generator) -> None:
+    """Trees between the lots and a ragged treeline around the town at about `radius` metres."""
+    turn = np.linspace(0, 2 * np.pi, 130, endpoint=False)
+    reach = radius * (1 + 0.05 * np.sin(3 * turn + rng.uniform(0, 6)) + rng.normal(0, 0.02, len(turn)))
+    ring = np.column_stack([np.cos(turn), np.sin(turn)])
+    # a rounded square reaches into the corners of the ground
+    ring *= (reach / np.maximum(np.abs(ring).max(1), 0.8))[:, None]
+    ring = ring[_in_sight(site, ring) & (rng.random(len(ring)) < 0.9)]
+    for at in ring:
+        if site.free(at[None], 8.0):
+            site.put(_pick(greens["far"], rng), at, rng.uniform(0, 6), rng.uniform(0.7, 1.2))
+    spots = rng.uniform(-0.95 * radius, 0.95 * radius, (500, 2))
+    spots = spots[(site.ground.edge(spots) > 6) & ~site.taken(spots) & _in_sight(site, spots)]
+    for at in spots[:60]:
+        around = at + 3 * np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
+        if not site.taken(around).any():
+            kind = str(rng.choice(["small", "bush", "conifer", "far", "bare"], p=[0.3, 0.3, 0.1, 0.25, 0.05]))
+            site.put(_pick(greens[kind], rng), at, rng.uniform(0, 6), rng.uniform(0.8, 1.3))

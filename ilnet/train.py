@@ -1,0 +1,140 @@
+"""Training with Lightning: L1 on normalised ranges, rays at continuous directions (paper, Sec. III-B)."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.loggers import CSVLogger
+from torch.utils.data import DataLoader
+
+from ilnet import data, metrics, models
+from ilnet.scan import Scan
+from ilnet.sensor import preset
+
+__all__ = ["PRESETS", "Preset", "Training", "train"]
+
+INPUT = "paper-16x1024"
+OUTPUT = "paper-64x1024"
+TOWN = "town01"
+# Towns that differ by their seed: streets to learn from, and one to choose by. Seed 0, the default, is left for tests.
+TRAIN_SEEDS = (1, 2, 3, 4)
+HELD_OUT_SEED = 5
+HELD_OUT_SCANS = 8
+
+
+@dataclass(frozen=True)
+class Preset:
+    """The size of a network and of its training."""
+
+    blocks: int
+    """Residual blocks of the encoder."""
+    steps: int
+    """Optimiser steps."""
+    rate: float
+    """Highest learning rate; it rises over the first steps and falls to 0 as a cosine."""
+    crops: int = 16
+    """Crops in a step."""
+    columns: int = 128
+    """Columns of a crop."""
+    queries: int = 2048
+    """Rays per crop."""
+    dropout: float = 0.0
+    """In the attention blocks."""
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What differs from the model's own defaults."""
+        return {"blocks": self.blocks, "dropout": self.dropout}
+
+
+PRESETS = {"tiny": Preset(blocks=4, steps=200, rate=1e-3)}
+
+
+class Training(lightning.LightningModule):
+    """One network, its loss, its schedule and its validation.
+
+    Args:
+        model: What is trained; it has a `norm_range`.
+        held_out: Pairs of an input scan and the scan to be predicted.
+        rate: Highest learning rate.
+    """
+
+    def __init__(self, model: models.ILN, held_out: list[list[Scan]], rate: float):
+        super().__init__()
+        self.model, self.held_out, self.rate = model, held_out, rate
+
+    def training_step(self, batch: data.Batch, index: int) -> torch.Tensor:
+        """L1 between ranges scaled to [-1, 1]."""
+        predicted = self.model(batch.image, batch.queries, wrap=False)
+        loss = (predicted - batch.ranges).abs().mean() * (2 / self.model.norm_range)
+        self.log("loss", loss, prog_bar=True)
+        return loss
+
+    def validation_step(self, number: int, index: int) -> None:
+        """Measures one held-out scan."""
+        scan, truth = self.held_out[number]
+        for name, value in metrics.compare(self.model.ranges(scan, truth.sensor).float(), truth).items():
+            self.log(f"val/{name}", value, prog_bar=name in ("mae", "iou"), batch_size=1)
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        """Adam; the rate warms up and decays to 0."""
+        optimizer = torch.optim.Adam(self.parameters(), lr=self.rate)
+        steps = int(self.trainer.estimated_stepping_batches)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, self.rate, steps, pct_start=min(0.3, 100 / steps))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def train(
+    name: str, preset_name: str, out: Path, steps: int | None = None, seed: int = 0, **arguments: Any
+) -> dict[str, float]:
+    """Trains a model and writes its weights and figures.
+
+    Args:
+        name: One of `models.TRAINABLE`.
+        preset_name: One of `PRESETS`.
+        out: Folder for `NAME.safetensors`, checkpoints and `metrics.csv`; training goes on from a checkpoint there.
+        steps: Overrides the preset's.
+        seed: Of the initial weights and the rays.
+        **arguments: Override the model's.
+
+    Returns:
+        The last figures on held-out scans.
+    """
+    size = PRESETS[preset_name]
+    steps = size.steps if steps is None else steps
+    lightning.seed_everything(seed, verbose=False)
+    arguments = {**size.arguments, **arguments}
+    model = models.create(name, **arguments)
+    assert isinstance(model, models.ILN)
+    rays = data.ContinuousRays(
+        [data.street(TOWN, s) for s in TRAIN_SEEDS], preset(INPUT), size.crops, size.columns, size.queries, seed
+    )
+    held_out = data.held_out_scans(data.street(TOWN, HELD_OUT_SEED), HELD_OUT_SCANS, [preset(INPUT), preset(OUTPUT)])
+    training = Training(model, held_out, size.rate)
+    trainer = lightning.Trainer(
+        max_steps=steps,
+        precision="bf16-mixed",
+        accelerator="auto",
+        devices=1,
+        val_check_interval=min(steps, 100),
+        num_sanity_val_steps=0,
+        log_every_n_steps=10,
+        logger=CSVLogger(out, name="", version=name),
+        callbacks=[ModelCheckpoint(out / name, filename="last", every_n_train_steps=100), TQDMProgressBar()],
+        enable_model_summary=False,
+    )
+    last = out / name / "last.ckpt"
+    trainer.fit(
+        training,
+        DataLoader(rays, batch_size=None),
+        DataLoader(range(len(held_out)), batch_size=None),
+        ckpt_path=last if last.exists() else None,
+    )
+    figures = {key: round(float(value), 4) for key, value in trainer.callback_metrics.items() if key.startswith("val/")}
+    models.save(
+        model, out / f"{name}.safetensors", name, arguments, preset=asdict(size), steps=steps, seed=seed, held_out=figures
+    )
+    return figures

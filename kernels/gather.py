@@ -1,0 +1,133 @@
+"""gather_neighbours: features and offsets of the 4 pixels around each query (paper, Sec. II-B, z_t and Δq_t)."""
+
+from typing import Any
+
+import torch
+import warp as wp
+
+from kernels import reference
+from kernels.launch import check_backend, launch, overload
+from kernels.neighbours import broadcast_batch, channel_span, check_queries, neighbour, offset, adjoint_of_gather
+
+__all__ = ["gather_neighbours"]
+
+
+@wp.kernel(enable_backward=False)
+def _gather_neighbours_kernel(
+    first: int,
+    # in
+    features: wp.array4d[Any],
+    queries: wp.array3d[Any],
+    span: int,
+    wrap: int,
+    # out
+    gathered_out: wp.array4d[Any],
+    offsets_out: wp.array4d[Any],
+):
+    channels = features.shape[3]
+    spans = (channels + span - 1) // span
+    thread = first + wp.tid()
+    begin = (thread % spans) * span
+    end = wp.min(begin + span, channels)
+    t = (thread // spans) % 4
+    q = (thread // spans // 4) % queries.shape[1]
+    b = thread // spans // 4 // queries.shape[1]
+    row = queries[b, q, 0]
+    column = queries[b, q, 1]
+    i, j = neighbour(row, column, t, features.shape[1], features.shape[2], wrap)
+    for c in range(begin, end):
+        gathered_out[b, q, t, c] = features[b, i, j, c]
+    if begin == 0:
+        dr, dc = offset(row, column, t, features.shape[1], features.shape[2], wrap)
+        offsets_out[b, q, t, 0] = dr
+        offsets_out[b, q, t, 1] = dc
+
+
+_gather = overload(_gather_neighbours_kernel)
+
+
+@torch.library.custom_op("kernels::gather_neighbours", mutates_args=())
+def _gather_neighbours(features: torch.Tensor, queries: torch.Tensor, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    batch, _, _, channels = features.shape
+    count = queries.shape[1]
+    gathered = features.new_empty(batch, count, 4, channels)
+    offsets = features.new_empty(batch, count, 4, 2)
+    span = channel_span(channels, features.device)
+    threads = batch * count * 4 * -(-channels // span)
+    launch(_gather[features.dtype], threads, [features, queries, span, int(wrap)], [gathered, offsets])
+    return gathered, offsets
+
+
+@_gather_neighbours.register_fake
+def _(features: torch.Tensor, queries: torch.Tensor, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    batch, _, _, channels = features.shape
+    count = queries.shape[1]
+    return features.new_empty(batch, count, 4, channels), features.new_empty(batch, count, 4, 2)
+
+
+@torch.library.custom_op("kernels::gather_neighbours_backward", mutates_args=())
+def _gather_neighbours_backward(
+    gradient: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool
+) -> torch.Tensor:
+    return adjoint_of_gather(gradient, queries, height, width, wrap)
+
+
+@_gather_neighbours_backward.register_fake
+def _(gradient: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
+    return gradient.new_empty(gradient.shape[0], height, width, gradient.shape[3])
+
+
+def _setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
+    features, queries, ctx.wrap = inputs
+    ctx.save_for_backward(queries)
+    ctx.height, ctx.width = features.shape[1:3]
+
+
+def _backward(ctx: Any, gradient: torch.Tensor, _: torch.Tensor) -> tuple[torch.Tensor | None, None, None]:
+    (queries,) = ctx.saved_tensors
+    if not ctx.needs_input_grad[0]:
+        return None, None, None
+    return _gather_neighbours_backward(gradient, queries, ctx.height, ctx.width, ctx.wrap), None, None
+
+
+_gather_neighbours.register_autograd(_backward, setup_context=_setup_context)
+
+
+def gather_neighbours(
+    features: torch.Tensor, queries: torch.Tensor, wrap: bool = True, backend: str = "warp"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Gathers the features of the 4 pixels around each query and the query's offset from each.
+
+    Differentiable in `features`; `queries` and the offsets carry no gradient. The backward pass is deterministic.
+
+    Args:
+        features: (..., C, H, W) float32 or float64. Memory format `channels_last` is read in place.
+        queries: (..., Q, 2) pixel coordinates (row, column); integers are pixel centres. Leading dimensions broadcast
+            against those of `features`.
+        wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
+        backend: "warp", or "torch" for the plain twin in `kernels.reference`.
+
+    Returns:
+        gathered: (..., Q, 4, C), neighbours in the order (row-, col-), (row-, col+), (row+, col-), (row+, col+).
+        offsets: (..., Q, 4, 2), query minus neighbour in pixels.
+
+    Raises:
+        TypeError: If `features` or `queries` is not a floating-point tensor of a supported dtype.
+        ValueError: If a shape, device or backend does not fit.
+
+    Source: paper Sec. II-B, "Local feature extraction" (z_t, Δq_t).
+    """
+    check_backend(backend)
+    if not isinstance(features, torch.Tensor) or features.dtype not in _gather:
+        kind = getattr(features, "dtype", type(features).__name__)
+        raise TypeError(f"features is {kind}; it should be a float32 or float64 tensor (..., C, H, W)")
+    if features.ndim < 3 or 0 in features.shape[-3:]:
+        raise ValueError(f"features has shape {tuple(features.shape)}; it should be (..., C, H, W), none of them 0")
+    check_queries(queries, features, "features")
+    queries = queries.detach().to(features.dtype)
+    batch, (features, queries) = broadcast_batch(features=(features, 3), queries=(queries, 2))
+    if backend == "torch":
+        gathered, offsets = reference.gather_neighbours(features, queries, wrap)
+    else:
+        gathered, offsets = _gather_neighbours(features.movedim(1, 3).contiguous(), queries.contiguous(), wrap)
+    return gathered.reshape(*batch, *gathered.shape[1:]), offsets.reshape(*batch, *offsets.shape[1:])

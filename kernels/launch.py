@@ -1,0 +1,122 @@
+"""The one way a kernel is launched: torch tensors in, on their device, stream and CPU cores."""
+
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import torch
+import warp as wp
+
+__all__ = ["BACKENDS", "check_backend", "launch", "overload"]
+
+BACKENDS = ("warp", "torch")
+
+# Below this many threads of work a second core costs more to wake than it saves.
+_MIN_CHUNK = 512
+# More chunks than cores, so that a core which drew the cheap ones takes another.
+_CHUNKS_PER_CORE = 4
+
+# For each dtype of the tensors what Warp calls it, and the scalar that a kernel computes with.
+_DTYPES = {
+    torch.float32: (wp.float32, wp.float32),
+    torch.float64: (wp.float64, wp.float64),
+    torch.bfloat16: (wp.bfloat16, wp.float32),
+    torch.float16: (wp.float16, wp.float32),
+}
+
+_lock = threading.Lock()
+_pools: dict[int, ThreadPoolExecutor] = {}
+
+# Warp greets and reports each compilation on stdout, where the command line prints results.
+wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+
+
+def _forget_pools() -> None:
+    # Threads do not survive a fork (DataLoader workers): the child makes its own, and a new lock as well.
+    global _lock
+    _lock = threading.Lock()
+    _pools.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_pools)
+
+
+def _pool(cores: int) -> ThreadPoolExecutor:
+    with _lock:
+        if cores not in _pools:
+            _pools[cores] = ThreadPoolExecutor(cores, thread_name_prefix="kernels")
+        return _pools[cores]
+
+
+def check_backend(backend: str) -> None:
+    """Raises ValueError unless `backend` is one of `BACKENDS`."""
+    if backend not in BACKENDS:
+        raise ValueError(f"backend is {backend!r}; it should be one of {', '.join(BACKENDS)}")
+
+
+def overload(kernel: wp.Kernel, half: bool = False) -> dict[torch.dtype, wp.Kernel]:
+    """Instantiates a generic kernel for the dtypes it serves.
+
+    All are made when the module is imported: a later overload would change the module's hash and compile it again.
+
+    Args:
+        kernel: A kernel whose arrays of numbers are annotated `Any`, and whose scalars of that kind are too; a scalar
+            is float32 beside arrays of half precision, so that `type(scalar)` is what to compute with.
+        half: Whether bfloat16 and float16 are served besides float32 and float64.
+
+    Returns:
+        The concrete kernel for each torch dtype.
+    """
+    dtypes = list(_DTYPES) if half else [torch.float32, torch.float64]
+
+    def concrete(annotation: Any, stored: type, computed: type) -> Any:
+        if getattr(annotation, "dtype", None) is Any:
+            return wp.array(dtype=stored, ndim=annotation.ndim)
+        return computed if annotation is Any else annotation
+
+    return {
+        dtype: wp.overload(kernel, [concrete(arg.type, *_DTYPES[dtype]) for arg in kernel.adj.args]) for dtype in dtypes
+    }
+
+
+def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[torch.Tensor]) -> None:
+    """Runs `threads` threads of a kernel on the device of its outputs and waits for nothing but CPU work.
+
+    A kernel's first argument is `first: int`, the number of its first thread: Warp runs a CPU launch on one core,
+    so that a CPU launch is split into ranges of threads that run side by side (Warp releases the GIL). The threads
+    of a kernel therefore must not write to shared elements, not even atomically: Warp's CPU atomics are plain adds.
+    The number of cores is torch's (`torch.set_num_threads`, `OMP_NUM_THREADS`), one inside a DataLoader worker.
+
+    Args:
+        kernel: A Warp kernel without generic arguments (see `overload`).
+        threads: How many threads to run.
+        inputs: The kernel's arguments after `first`: tensors, numbers, Warp handles.
+        outputs: Tensors the kernel writes, all on one device.
+    """
+    if threads == 0:
+        return
+    arguments = [
+        wp.from_torch(a.detach(), requires_grad=False, return_ctype=True) if isinstance(a, torch.Tensor) else a
+        for a in (*inputs, *outputs)
+    ]
+    device = outputs[0].device
+    if device.type == "cuda":
+        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
+            wp.launch(kernel, threads, inputs=[0, *arguments], device=wp.device_from_torch(device))
+        return
+
+    def run(bounds: tuple[int, int]) -> None:
+        wp.launch(kernel, bounds[1] - bounds[0], inputs=[bounds[0], *arguments], device="cpu", record_tape=False)
+
+    cores = torch.get_num_threads()
+    pieces = min(cores * _CHUNKS_PER_CORE, threads // _MIN_CHUNK)
+    if cores == 1 or pieces < 2:
+        run((0, threads))
+        return
+    with _lock:  # compiled or loaded once, before the cores ask for it together
+        wp.init()
+        kernel.module.load("cpu")
+    edges = [threads * i // pieces for i in range(pieces + 1)]
+    list(_pool(cores).map(run, zip(edges[:-1], edges[1:], strict=True)))

@@ -1,0 +1,225 @@
+"""The stencil: which 4 pixels surround a query, and where the query lies between them.
+
+A query is a continuous pixel coordinate (row, column) whose integers are pixel centres. Its neighbours are
+numbered (row-, col-), (row-, col+), (row+, col-), (row+, col+). Rows clamp at the image's first and last row. Columns
+wrap from W-1 to 0 on a full-circle image (`wrap`) and clamp otherwise. A query that lies on a pixel centre has that
+pixel as its neighbour 0. Clamped neighbours repeat a pixel: they are still four.
+"""
+
+from typing import Any
+
+import torch
+import warp as wp
+
+from kernels.launch import launch, overload
+
+__all__ = ["adjoint_of_gather", "area", "broadcast_batch", "channel_span", "check_queries", "neighbour", "offset"]
+
+
+@wp.func
+def base(coordinate: Any):
+    """The integer below a coordinate."""
+    return int(wp.floor(coordinate))
+
+
+@wp.func
+def column_of(column: int, width: int, wrap: int):
+    """The pixel column that an unbounded column number stands for."""
+    if wrap != 0:
+        return ((column % width) + width) % width
+    return wp.clamp(column, 0, width - 1)
+
+
+@wp.func
+def neighbour(row: Any, column: Any, t: int, height: int, width: int, wrap: int):
+    """Pixel (row, column) of the query's neighbour number t."""
+    return (
+        wp.clamp(base(row) + t // 2, 0, height - 1),
+        column_of(base(column) + t % 2, width, wrap),
+    )
+
+
+@wp.func
+def offset(row: Any, column: Any, t: int, height: int, width: int, wrap: int):
+    """Query minus neighbour number t in pixels (rows, columns); never a jump over the seam."""
+    r = wp.clamp(base(row) + t // 2, 0, height - 1)
+    c = base(column) + t % 2
+    if wrap == 0:
+        c = wp.clamp(c, 0, width - 1)
+    return row - type(row)(r), column - type(column)(c)
+
+
+@wp.func
+def area(row: Any, column: Any, t: int):
+    """Bilinear weight of neighbour t: the area between the query and the diagonally opposite neighbour (S_t / S)."""
+    fr = row - wp.floor(row)
+    fc = column - wp.floor(column)
+    one = type(row)(1.0)
+    if t // 2 == 0:
+        fr = one - fr
+    if t % 2 == 0:
+        fc = one - fc
+    return fr * fc
+
+
+@wp.func
+def cell(row: Any, column: Any, height: int, width: int, wrap: int):
+    """Number of the cell between pixel centres that holds a query: (height + 1) rows of (width + 1) cells.
+
+    Queries of one cell share their neighbours; cell (i, j) has pixel (i, j) as its neighbour 3, before clamping.
+    """
+    i = wp.clamp(base(row) + 1, 0, height)
+    j = wp.clamp(base(column) + 1, 0, width)
+    if wrap != 0:
+        j = column_of(base(column), width, 1) + 1
+    return i * (width + 1) + j
+
+
+@wp.func
+def cell_index(i: int, j: int, k: int, height: int, width: int, wrap: int):
+    """The k-th (0..3) cell whose queries have pixel (i, j) as a neighbour, or -1.
+
+    The clamped border needs no special case: its cells have the border pixel as two neighbours. -1 stands for a
+    cell met before, when one column wraps onto itself.
+    """
+    ci = i + k // 2
+    cj = j + k % 2
+    if wrap != 0:
+        if width == 1 and cj == 1:
+            return -1
+        if cj == 0:
+            cj = width
+    return ci * (width + 1) + cj
+
+
+@wp.kernel(enable_backward=False)
+def _number_cells_kernel(
+    first: int,
+    # in
+    queries: wp.array3d[Any],
+    height: int,
+    width: int,
+    wrap: int,
+    # out
+    cells_out: wp.array2d[wp.int32],
+):
+    thread = first + wp.tid()
+    b = thread // queries.shape[1]
+    q = thread % queries.shape[1]
+    cells_out[b, q] = cell(queries[b, q, 0], queries[b, q, 1], height, width, wrap)
+
+
+@wp.kernel(enable_backward=False)
+def _adjoint_of_gather_kernel(
+    first: int,
+    # in
+    gradients: wp.array4d[Any],
+    queries: wp.array3d[Any],
+    order: wp.array2d[wp.int32],
+    starts: wp.array2d[wp.int32],
+    span: int,
+    wrap: int,
+    # out
+    pixels_out: wp.array4d[Any],
+):
+    height = pixels_out.shape[1]
+    width = pixels_out.shape[2]
+    spans = (pixels_out.shape[3] + span - 1) // span
+    thread = first + wp.tid()
+    begin = (thread % spans) * span
+    end = wp.min(begin + span, pixels_out.shape[3])
+    pixel = thread // spans
+    b = pixel // (height * width)
+    i = (pixel // width) % height
+    j = pixel % width
+    for c in range(begin, end):
+        pixels_out[b, i, j, c] = pixels_out.dtype(0.0)
+    for k in range(4):
+        n = cell_index(i, j, k, height, width, wrap)
+        if n >= 0:
+            for s in range(starts[b, n], starts[b, n + 1]):
+                q = order[b, s]
+                for t in range(4):
+                    r, col = neighbour(queries[b, q, 0], queries[b, q, 1], t, height, width, wrap)
+                    if r == i and col == j:
+                        for c in range(begin, end):
+                            pixels_out[b, i, j, c] = pixels_out[b, i, j, c] + gradients[b, q, t, c]
+
+
+_number_cells = overload(_number_cells_kernel)
+_adjoint_of_gather = overload(_adjoint_of_gather_kernel)
+
+
+def adjoint_of_gather(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
+    """Sums what the queries say of their neighbours into the pixels: the adjoint of gathering, as a gather.
+
+    Each pixel reads the queries of the cells around it, in a fixed order. A scatter would need atomics: not
+    deterministic on a GPU, and not safe on several CPU cores.
+
+    Args:
+        gradients: (B, Q, 4, C) float32 or float64, for each query and neighbour.
+        queries: (B, Q, 2) pixel coordinates, same dtype.
+        height: Rows H of the image.
+        width: Columns W of the image.
+        wrap: Whether columns wrap around the seam.
+
+    Returns:
+        (B, H, W, C).
+    """
+    batch, count, _, channels = gradients.shape
+    cells = torch.empty(batch, count, dtype=torch.int32, device=queries.device)
+    launch(_number_cells[queries.dtype], batch * count, [queries, height, width, int(wrap)], [cells])
+    cells, order = torch.sort(cells, dim=1, stable=True)
+    numbers = torch.arange((height + 1) * (width + 1) + 1, dtype=torch.int32, device=queries.device)
+    starts = torch.searchsorted(cells, numbers.expand(batch, -1).contiguous(), out_int32=True)
+    pixels = gradients.new_empty(batch, height, width, channels)
+    span = channel_span(channels, gradients.device)
+    launch(
+        _adjoint_of_gather[gradients.dtype],
+        batch * height * width * -(-channels // span),
+        [gradients, queries, order.to(torch.int32), starts, span, int(wrap)],
+        [pixels],
+    )
+    return pixels
+
+
+def channel_span(channels: int, device: torch.device) -> int:
+    """How many channels a thread handles: all on a CPU core, one on a GPU, whose neighbouring threads read together."""
+    return 1 if device.type == "cuda" else channels
+
+
+def check_queries(queries: torch.Tensor, like: torch.Tensor, name: str) -> None:
+    """Raises unless `queries` is a floating (..., Q, 2) tensor on the device of `like`, the argument called `name`."""
+    if not isinstance(queries, torch.Tensor):
+        raise TypeError(f"queries is a {type(queries).__name__}; it should be a torch.Tensor (..., Q, 2)")
+    if queries.ndim < 2 or queries.shape[-1] != 2:
+        raise ValueError(f"queries has shape {tuple(queries.shape)}; it should be (..., Q, 2): row and column in pixels")
+    if not queries.is_floating_point():
+        raise TypeError(f"queries is {queries.dtype}; it should be a floating-point tensor of pixel coordinates")
+    if queries.device != like.device:
+        raise ValueError(f"queries is on {queries.device}, {name} on {like.device}; they should be on one device")
+
+
+def broadcast_batch(**named: tuple[torch.Tensor, int]) -> tuple[torch.Size, list[torch.Tensor]]:
+    """Broadcasts leading dimensions and folds them into one.
+
+    Args:
+        **named: For each argument its tensor and how many trailing dimensions are not batch.
+
+    Returns:
+        The broadcast batch shape, and the tensors as (B, ...) in the order given.
+
+    Raises:
+        ValueError: If the batch shapes do not broadcast.
+    """
+    batches = {name: tensor.shape[: tensor.ndim - own] for name, (tensor, own) in named.items()}
+    try:
+        batch = torch.broadcast_shapes(*batches.values())
+    except RuntimeError:
+        shapes = ", ".join(f"{name} {tuple(shape)}" for name, shape in batches.items())
+        raise ValueError(f"the batch dimensions do not broadcast: {shapes}") from None
+    folded = [
+        tensor.expand(*batch, *tensor.shape[tensor.ndim - own :]).reshape(-1, *tensor.shape[tensor.ndim - own :])
+        for tensor, own in named.values()
+    ]
+    return batch, folded

@@ -1,0 +1,93 @@
+"""Every op again in plain PyTorch, written to be read: the oracle of the tests and the backend "torch".
+
+Shapes are those of the ops with the leading dimensions folded into one batch B; autograd derives the gradients.
+"""
+
+import math
+
+import torch
+
+__all__ = [
+    "PRIORS",
+    "RANGE_FLOOR",
+    "areas",
+    "gather_blend",
+    "gather_neighbours",
+    "neighbour_attention",
+    "neighbours",
+]
+
+PRIORS = ("none", "bilinear", "perspective")
+
+# Metres. The perspective prior divides by range; no LiDAR measures below this.
+RANGE_FLOOR = 0.1
+
+
+def neighbours(
+    queries: torch.Tensor, height: int, width: int, wrap: bool
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Rows and columns of the 4 neighbours, and the queries' offsets from them.
+
+    Args:
+        queries: (..., 2) pixel coordinates.
+        height: Rows H of the image.
+        width: Columns W of the image.
+        wrap: Whether columns wrap around the seam.
+
+    Returns:
+        rows, columns: (..., 4) int64 pixel indices.
+        offsets: (..., 4, 2), query minus neighbour in pixels.
+    """
+    row, column = queries.unbind(-1)
+    below, left = row.floor(), column.floor()
+    rows = torch.stack([below, below, below + 1, below + 1], -1).clamp(0, height - 1)
+    columns = torch.stack([left, left + 1, left, left + 1], -1)
+    if not wrap:
+        columns = columns.clamp(0, width - 1)
+    offsets = torch.stack([row.unsqueeze(-1) - rows, column.unsqueeze(-1) - columns], -1)
+    return rows.long(), columns.long() % width, offsets
+
+
+def areas(queries: torch.Tensor) -> torch.Tensor:
+    """Bilinear weights S_t / S of the 4 neighbours (paper, Eq. 2): each the area of the diagonally opposite rectangle.
+
+    Args:
+        queries: (..., 2) pixel coordinates.
+
+    Returns:
+        (..., 4), summing to 1.
+    """
+    fraction = queries - queries.floor()
+    fr, fc = fraction.unbind(-1)
+    return torch.stack([(1 - fr) * (1 - fc), (1 - fr) * fc, fr * (1 - fc), fr * fc], -1)
+
+
+def gather_neighbours(
+    features: torch.Tensor, queries: torch.Tensor, wrap: bool
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """`kernels.gather_neighbours` on features (B, C, H, W) and queries (B, Q, 2)."""
+    rows, columns, offsets = neighbours(queries, *features.shape[2:], wrap)
+    image = torch.arange(len(features), device=features.device).view(-1, 1, 1)
+    return features.movedim(1, 3)[image, rows, columns], offsets
+
+
+def gather_blend(
+    image: torch.Tensor, queries: torch.Tensor, scores: torch.Tensor, prior: str, wrap: bool, area_floor: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """`kernels.gather_blend` on image (B, H, W), queries (B, Q, 2) and scores (B, Q, 4), with the weights."""
+    gathered, _ = gather_neighbours(image.unsqueeze(1), queries, wrap)
+    ranges = gathered.squeeze(-1)
+    logits = scores
+    if prior != "none":
+        logits = logits + areas(queries).clamp(min=area_floor).log()
+    if prior == "perspective":
+        logits = logits - ranges.clamp(min=RANGE_FLOOR).log()
+    weights = logits.softmax(-1)
+    return (weights * ranges).sum(-1), weights
+
+
+def neighbour_attention(qkv: torch.Tensor) -> torch.Tensor:
+    """`kernels.neighbour_attention` on (N, 12, heads, D), the 4 neighbours' queries, keys and values in turn."""
+    q, k, v = qkv.unflatten(1, (4, 3)).unbind(2)
+    logits = torch.einsum("nihd,njhd->nhij", q, k) / math.sqrt(qkv.shape[-1])
+    return torch.einsum("nhij,njhd->nihd", logits.softmax(-1), v)

@@ -1,0 +1,115 @@
+import numpy as np
+import pytest
+import torch
+
+from ilnet import towns
+from kernels.raycast import Mesh
+
+SENSOR_HEIGHT = 1.8
+CLEARANCE = 1.2
+GROUND_TOLERANCE = 0.01  # half a step of the vertex raster, and slopes up to 6 % over it
+
+
+def _cast(mesh, origins, directions, max_range=80.0):
+    """Ranges (N, M) of directions (M, 3) from origins (N, 3)."""
+    each = np.repeat(origins, len(directions), axis=0), np.tile(directions, (len(origins), 1))
+    hits = mesh.cast(*(torch.from_numpy(a.astype(np.float32)) for a in each), max_range)
+    return hits.range.numpy().reshape(len(origins), len(directions))
+
+
+@pytest.fixture(scope="module")
+def town():
+    return towns.build("town01")
+
+
+@pytest.fixture(scope="module")
+def mesh(town):
+    return Mesh(town.vertices, town.triangles)
+
+
+@pytest.fixture(scope="module")
+def sensors(town):
+    """Sensor positions above 40 waypoints spread over the town."""
+    return town.waypoints[:: len(town.waypoints) // 40] + np.float32([0, 0, SENSOR_HEIGHT])
+
+
+def test_same_seed_same_arrays(town):
+    again = towns.build("town01", 0)
+    for field in ("vertices", "triangles", "waypoints", "headings"):
+        np.testing.assert_array_equal(getattr(again, field), getattr(town, field))
+
+
+def test_another_seed_is_another_town(town):
+    other = towns.build("town01", 1)
+    assert other.seed == 1
+    assert other.vertices.shape != town.vertices.shape
+    nearest = np.linalg.norm(other.waypoints[::20, None, :2] - town.waypoints[None, ::2, :2], axis=-1).min(1)
+    assert np.median(nearest) > 4
+
+
+def test_arrays_are_what_the_docstring_says(town):
+    assert town.vertices.dtype == town.waypoints.dtype == town.headings.dtype == np.float32
+    assert town.triangles.dtype == np.int32
+    assert town.vertices.shape[1] == town.triangles.shape[1] == town.waypoints.shape[1] == 3
+    assert town.headings.shape == (len(town.waypoints),)
+    for array in (town.vertices, town.waypoints, town.headings):
+        assert np.isfinite(array).all()
+    assert town.triangles.min() >= 0
+    assert town.triangles.max() < len(town.vertices)
+    np.testing.assert_array_equal(town.vertices * 1024, np.round(town.vertices * 1024))
+
+
+def test_triangles_have_area(town):
+    a, b, c = (town.vertices[town.triangles[:, k]].astype(np.float64) for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    assert area.min() > 1e-7
+    assert 250_000 < len(area) < 800_000
+
+
+def test_waypoints_follow_their_lane(town):
+    step = np.diff(town.waypoints, axis=0)
+    length = np.linalg.norm(step[:, :2], axis=1)
+    in_lane = (length < 3) & (np.cos(np.diff(town.headings)) > 0.9)
+    assert in_lane.mean() > 0.9
+    np.testing.assert_allclose(length[in_lane], 1.8, atol=0.05)
+    ahead = np.arctan2(step[:, 1], step[:, 0])[in_lane]
+    turn = np.angle(np.exp(1j * (ahead - town.headings[:-1][in_lane])))
+    assert np.abs(turn).max() < 0.2
+    slope = np.abs(step[in_lane, 2]) / length[in_lane]
+    assert slope.max() < 0.08
+
+
+def test_road_lies_under_every_waypoint(town, mesh):
+    drop = _cast(mesh, town.waypoints + np.float32([0, 0, SENSOR_HEIGHT]), np.float32([[0, 0, -1]]))
+    np.testing.assert_allclose(drop, SENSOR_HEIGHT, atol=GROUND_TOLERANCE)
+
+
+def test_sensors_have_room(town, mesh):
+    k = np.arange(200) + 0.5  # a spiral of even directions
+    polar, turn = np.arccos(1 - k / 100), np.pi * (1 + 5**0.5) * k
+    sphere = np.column_stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)])
+    ranges = _cast(mesh, town.waypoints + np.float32([0, 0, SENSOR_HEIGHT]), sphere, CLEARANCE)
+    assert (ranges == 0).all()
+
+
+def test_ground_is_closed(mesh, sensors):
+    azimuth = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    for elevation in np.radians([-20.0, -8.0]):
+        way = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.full(720, np.tan(elevation))])
+        assert (_cast(mesh, sensors, way, 200.0) > 0).all()
+
+
+def test_scans_look_like_streets(mesh, sensors):
+    azimuth = np.linspace(0, 2 * np.pi, 1024, endpoint=False)
+    elevation = np.radians(np.linspace(15, -15, 32))[:, None]
+    way = np.broadcast_arrays(
+        np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+    )
+    ranges = _cast(mesh, sensors, np.stack(way, axis=-1).reshape(-1, 3)).reshape(-1, 32, 1024)
+    assert 0.7 < (ranges > 0).mean() < 0.9
+    assert (np.abs(np.diff(ranges)) > 0.5).mean() > 0.04
+
+
+def test_unknown_name_is_refused():
+    with pytest.raises(ValueError, match=r"'nowhere'.*town01"):
+        towns.build("nowhere")
