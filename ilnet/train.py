@@ -119,7 +119,7 @@ def train(
         precision="bf16-mixed",
         accelerator="auto",
         devices=1,
-        val_check_interval=min(steps, 100),
+        val_check_interval=min(steps, 200),
         num_sanity_val_steps=0,
         log_every_n_steps=10,
         logger=CSVLogger(out, name="", version=name),

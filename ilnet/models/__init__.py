@@ -19,7 +19,7 @@ _MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
     "bilinear": (Bilinear, {}),
     "bilinear-inverse": (Bilinear, {"inverse": True}),
     "iln": (ILN, {}),
-    "iln-prior": (ILN, {"prior": "bilinear"}),
+    "iln-prior": (ILN, {"prior": "perspective"}),
 }
 NAMES = tuple(_MODELS)
 TRAINABLE = tuple(name for name, (kind, _) in _MODELS.items() if kind is ILN)

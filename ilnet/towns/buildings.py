@@ -156,9 +156,9 @@ def _balcony(width: float, out: float, solid: bool) -> Part:
         low = [[-width / 2, -out, 0], [-width / 2, -out, 0], [width / 2 - 0.08, -out, 0]]
         high = [[width / 2, -out + 0.08, 0.95], [-width / 2 + 0.08, 0, 0.95], [width / 2, 0, 0.95]]
         return merge([slab, boxes(low, high)])
-    front = shift(railing(width, gap=0.18), -width / 2, -out + 0.05)
+    front = shift(railing(width, gap=0.2), -width / 2, -out + 0.05)
     sides = place(
-        railing(out - 0.05, gap=0.18),
+        railing(out - 0.05, gap=0.2),
         [[-width / 2 + 0.03, -out + 0.05, 0], [width / 2 - 0.03, -out + 0.05, 0]],
         np.pi / 2,
     )
@@ -302,7 +302,7 @@ def block(rng: np.random.Generator, width: float, depth: float, floors: int, gro
             openings = np.concatenate([openings[keep], [[centre - half, centre + half, 0.02, height]]])
             depths = np.concatenate([depths[keep], [deep]])
         lower.append(wall(length_low, -_FOOTING, first, openings, depths))
-        openings = row if k == 0 else _windows(length, 1.7 * pitch, size, 0.9)
+        openings = row if k == 0 else _windows(length, 2.2 * pitch, size, 0.9)
         part = wall(length, 0.0, storey, openings, recess)
         upper.append(merge([part, _trim(openings, rich)]) if rich and len(openings) and k == 0 else part)
     parts.append(_around(lower, width, depth, front_y))

@@ -14,17 +14,18 @@ def greenery(rng: np.random.Generator) -> dict[str, list[Part]]:
     """Prototypes of plants: of the street ("tall"), of gardens ("small"), of the distance ("far"), and others."""
     return {
         "tall": [
-            plants.tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 580, (0.2, 0.42), twigs=3)
+            plants.tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 500, (0.22, 0.42), twigs=3)
             for _ in range(5)
         ],
         "small": [
-            plants.tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 420, (0.15, 0.35)) for _ in range(4)
+            plants.tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 340, (0.17, 0.35)) for _ in range(4)
         ],
         "bare": [plants.tree(rng, rng.uniform(7, 10), rng.uniform(2.2, 3.0), 3.3, 0, (0, 0)) for _ in range(2)],
-        "conifer": [plants.conifer(rng, rng.uniform(6, 11), 520) for _ in range(2)],
-        "bush": [plants.bush(rng, rng.uniform(0.6, 1.1), 130) for _ in range(4)],
+        "conifer": [plants.conifer(rng, rng.uniform(6, 11), 420) for _ in range(2)],
+        "bush": [plants.bush(rng, rng.uniform(0.6, 1.1), 110) for _ in range(4)],
         "far": [
-            plants.tree(rng, rng.uniform(9, 14), rng.uniform(3.2, 4.5), 1.5, 270, (0.5, 0.9), twigs=0) for _ in range(3)
+            plants.tree(rng, rng.uniform(9, 14), rng.uniform(3.2, 4.5), 1.5, 230, (0.55, 0.9), twigs=0)
+            for _ in range(3)
         ],
     }
 
@@ -105,7 +106,7 @@ def _park(site: Site, street: Street, side: int, rng: np.random.Generator) -> No
     s = np.arange(5, street.length - 5, 6.1) + rng.uniform(-0.4, 0.4)
     lateral = side * (street.half - 1.08)
     xy, heading = street.at(s, lateral)
-    busy = rng.random(len(s)) < rng.uniform(0.25, 0.5)
+    busy = rng.random(len(s)) < rng.uniform(0.18, 0.36)
     for step in (-6.0, -3.0, 0.0, 3.0, 6.0):  # no parking where the kerb turns away: junctions and the ends of streets
         near, _ = street.at(s + step, lateral)
         busy &= np.abs(site.ground.edge(near) + 1.08) < 0.3
@@ -189,7 +190,7 @@ def plant_fields(site: Site, greens: dict[str, list[Part]], radius: float, rng: 
             site.put(_pick(greens["far"], rng), at, rng.uniform(0, 6), rng.uniform(0.7, 1.2))
     spots = rng.uniform(-0.95 * radius, 0.95 * radius, (500, 2))
     spots = spots[(site.ground.edge(spots) > 6) & ~site.taken(spots) & _in_sight(site, spots)]
-    for at in spots[:60]:
+    for at in spots[:50]:
         around = at + 3 * np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
         if not site.taken(around).any():
             kind = str(rng.choice(["small", "bush", "conifer", "far", "bare"], p=[0.3, 0.3, 0.1, 0.25, 0.05]))

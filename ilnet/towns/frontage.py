@@ -112,22 +112,22 @@ def build_lots(site: Site, street: Street, side: int, greens: dict[str, list[Par
         if style == "rows":
             if left_in_row == 0:
                 row = (rng.uniform(5.5, 8.5), rng.uniform(8.5, 11), int(rng.integers(2, 4)))
-                left_in_row = int(rng.integers(3, 8))
+                left_in_row = int(rng.integers(3, 7))
                 row_setback = rng.choice([0.0, 1.6, 3.0])
             assert row is not None
             width, depth, floors = row
             setback, space = row_setback, 0.0
         elif style == "shops":
-            width, depth, floors = rng.uniform(10, 20), rng.uniform(11, 15), int(rng.integers(3, 6))
-            setback, space = rng.choice([0.0, 0.0, 0.6]), rng.choice([0.0, 0.0, 3.5, 7.0])
+            width, depth, floors = rng.uniform(10, 20), rng.uniform(11, 15), int(rng.integers(2, 6))
+            setback, space = rng.choice([0.0, 0.0, 0.6]), rng.choice([0.0, 0.0, 4.0, 12.0])
         elif style == "towers":
             width, depth, floors = rng.uniform(17, 30), rng.uniform(13, 17), int(rng.integers(4, 8))
-            setback, space = rng.choice([0.0, 2.0, 5.0]), rng.uniform(3, 14)
+            setback, space = rng.choice([0.0, 2.0, 5.0]), rng.uniform(5, 24)
             if rng.random() < 0.25:
                 width, depth, floors = rng.uniform(17, 22), rng.uniform(16, 20), int(rng.integers(9, 15))
         else:
             width, depth, floors = rng.uniform(8.5, 13), rng.uniform(8, 11), int(rng.integers(1, 3))
-            setback, space = rng.uniform(4, 8.5), rng.uniform(4.5, 9)
+            setback, space = rng.uniform(4, 9.5), rng.uniform(5, 11)
         lot = Lot(street, along + width / 2, side, setback)
         if along + width / 2 > street.length or not _try(site, lot, width, depth, kerb):
             along += 2.0
@@ -140,7 +140,7 @@ def build_lots(site: Site, street: Street, side: int, greens: dict[str, list[Par
                 edge = _boundary(rng)
                 if edge:
                     site.run(*edge, lot.world([[-width / 2, -setback + 0.2], [width / 4, -setback + 0.2]]))
-            space = rng.uniform(3, 9) if left_in_row == 0 else 0.0
+            space = rng.uniform(4, 13) if left_in_row == 0 else 0.0
         elif style in ("shops", "towers"):
             ground_floor = rng.choice(["shops", "arcade", "passage", "flats"], p=[0.4, 0.15, 0.15, 0.3])
             roof = "flat" if floors > 5 or rng.random() < 0.5 else "pitched"

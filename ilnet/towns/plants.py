@@ -40,7 +40,7 @@ def _branches(
     thick = 0.022 * height * (1 - 0.85 * knots / knots[-1]) + 0.02
     thick[0] *= 1.4
     parts = [tubes(trunk[:-1], trunk[1:], thick[:-1], thick[1:], sides=6, caps=False)]
-    count = 10
+    count = 9
     z = np.sort(rng.uniform(clear, 0.78 * height, count))
     root = np.column_stack([np.interp(z, knots, lean[:, k]) for k in range(2)] + [z])
     turn = 2.4 * np.arange(count) + rng.uniform(-0.4, 0.4, count)  # the golden angle spreads boughs evenly
@@ -114,7 +114,7 @@ def bush(rng: np.random.Generator, radius: float, leaves: int) -> Part:
 def hedge(rng: np.random.Generator, length: float, height: float, width: float) -> Part:
     """A clipped hedge along +x from the origin: a dense core with leaves standing out of it."""
     core = boxes([0.05, -width / 2 + 0.1, -0.3], [length - 0.05, width / 2 - 0.1, height - 0.1])
-    count = int(length * 28)
+    count = int(length * 22)
     face = rng.uniform(0, 2 * height + width, count)
     y = np.where(face < height, -width / 2, np.where(face > height + width, width / 2, face - height - width / 2))
     z = np.where(face < height, face, np.where(face > height + width, face - height - width, height))

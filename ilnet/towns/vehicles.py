@@ -62,7 +62,7 @@ def _wheels(x: list[float], half_width: float, radius: float, width: float = 0.2
     """Pairs of wheels."""
     at = np.array([[px, side * half_width, radius] for px in x for side in (-1, 1)])
     inward = np.array([[0, -side * width, 0] for _ in x for side in (-1, 1)])
-    return merge([tubes(at + inward, at, radius, sides=10)])
+    return merge([tubes(at + inward, at, radius, sides=8)])
 
 
 def _body(profile: Sequence[tuple[float, ...]], wheels: tuple[float, float], radius: float, clearance: float) -> Part:

@@ -1,0 +1,5 @@
+"""`python -m ilnet`."""
+
+from ilnet.cli import main
+
+main()

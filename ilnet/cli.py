@@ -1,0 +1,84 @@
+"""The command line: `python -m ilnet COMMAND`."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+__all__ = ["main"]
+
+# The commands import what they need themselves, so that `--help` and a typing error answer at once.
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+def cli() -> None:
+    """Implicit LiDAR Network: dense range images from sparse ones."""
+
+
+@cli.command()
+@click.option("--mesh", type=Path, metavar="FILE", help="Scan this mesh (metres, z up) instead of the town.")
+@click.option("--at", type=(float, float, float), metavar="X Y Z", help="Position of the sensor in the mesh [m].")
+@click.option("--scan", type=Path, metavar="FILE", help="Decimate this scan, and judge against all of its rows.")
+@click.option("--rows", type=int, default=16, show_default=True, help="Beams of the scan to keep.")
+@click.option("--out", type=Path, default=Path("demo_output"), show_default=True, help="Folder for the pictures.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the table.")
+def demo(
+    mesh: Path | None, at: tuple[float, float, float] | None, scan: Path | None, rows: int, out: Path, as_json: bool
+) -> None:
+    """Upsample a scan with every method: a table, pictures, a point cloud."""
+    if mesh and scan:
+        raise click.UsageError("--mesh and --scan exclude each other")
+    if bool(mesh) != (at is not None):
+        raise click.UsageError("--mesh FILE and --at X Y Z go together")
+    from ilnet import demo as demonstration
+
+    if mesh and at:
+        pair, source = demonstration.from_mesh(mesh, at), mesh.name
+    elif scan:
+        pair, source = demonstration.from_scan(scan, rows), scan.name
+    else:
+        pair, source = demonstration.from_town(), demonstration.TOWN
+    result = demonstration.demo(*pair, out, source)
+    if as_json:
+        click.echo(json.dumps(result))
+        return
+    click.echo(f"{source}: {result['input']} -> {result['output']}\n")
+    click.echo(_table(result["methods"]))
+    click.echo(f"\nrange images, 3-D picture and point cloud: {out}/")
+
+
+@cli.command()
+@click.argument("model")
+@click.option("--preset", default="tiny", show_default=True, help="Size of the network and of its training.")
+@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps, instead of the preset's.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the initial weights and the rays.")
+@click.option("--out", type=Path, default=Path("runs"), show_default=True, help="Folder for weights, figures, logs.")
+def train(model: str, preset: str, steps: int | None, seed: int, out: Path) -> None:
+    """Train MODEL on rays cast at continuous directions; goes on where an interrupted run in --out stopped."""
+    from ilnet import train as training
+
+    figures = training.train(model, preset, out, steps, seed)
+    click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
+
+
+def _table(methods: dict[str, dict[str, Any]]) -> str:
+    columns = {"mae": "MAE [m]", "iou": "IoU", "precision": "precision", "recall": "recall", "f1": "F1"}
+    lines = [f"{'method':18}" + "".join(f"{title:>11}" for title in columns.values())]
+    lines += [f"{name:18}" + "".join(f"{figures[c]:11.3f}" for c in columns) for name, figures in methods.items()]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Runs the command line; what a user can mend is one line on stderr and exit code 2."""
+    try:
+        sys.exit(cli.main(prog_name="python -m ilnet", standalone_mode=False))
+    except click.ClickException as error:
+        message = error.format_message()
+    except click.Abort:
+        sys.exit(130)
+    except (ValueError, OSError) as error:
+        message = str(error)
+    click.echo("error: " + " ".join(message.split()), err=True)
+    sys.exit(2)

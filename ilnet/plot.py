@@ -1,0 +1,91 @@
+"""Pictures: range images side by side, and scans as coloured points."""
+
+from pathlib import Path
+
+import matplotlib
+
+from ilnet.scan import Scan
+from ilnet.sensor import Sensor
+
+__all__ = ["point_clouds", "range_images"]
+
+# Readable in print and by the colour-blind; far is dark, no return is white.
+_COLOURS = "viridis_r"
+
+
+def _top_down(scan: Scan) -> tuple:
+    """The range image with the highest beam first and azimuth falling to the right, as one sees it; 0 as NaN."""
+    image = scan.ranges.cpu().numpy()
+    if scan.sensor.elevations[0] < scan.sensor.elevations[-1]:
+        image = image[::-1]
+    if scan.sensor.azimuths[0] < scan.sensor.azimuths[-1]:
+        image = image[:, ::-1]
+    image = image.copy()
+    image[image == 0] = float("nan")
+    return image, _degrees(scan.sensor)
+
+
+def _degrees(sensor: Sensor) -> list[float]:
+    """Left, right, bottom and top of the picture in degrees."""
+    azimuths, elevations = (sorted(a * 57.29577951308232) for a in (sensor.azimuths, sensor.elevations))
+    return [azimuths[-1], azimuths[0], elevations[0], elevations[-1]]
+
+
+def range_images(scans: dict[str, Scan], path: Path, title: str, sector: float | None = None) -> None:
+    """Draws range images under each other.
+
+    Args:
+        scans: What to draw by its caption.
+        path: A picture file; its suffix says the format.
+        title: Of the whole.
+        sector: Degrees of azimuth to show, centred on the sensor's middle column; all where None.
+    """
+    figure = matplotlib.figure.Figure(figsize=(12, 1.35 * len(scans) + 0.8), layout="constrained")
+    axes = figure.subplots(len(scans), 1, sharex=True, squeeze=False)[:, 0]
+    farthest = min(max(float(scan.ranges.max()) for scan in scans.values()), 60.0)
+    for axis, (caption, scan) in zip(axes, scans.items(), strict=True):
+        image, extent = _top_down(scan)
+        picture = axis.imshow(
+            image, extent=extent, aspect="auto", interpolation="nearest", cmap=_COLOURS, vmin=0, vmax=farthest
+        )
+        axis.set_title(caption, loc="left", fontsize=10)
+        axis.set_ylabel("elevation [°]", fontsize=8)
+        if sector is not None:
+            middle = (extent[0] + extent[1]) / 2
+            axis.set_xlim(middle + sector / 2, middle - sector / 2)
+    axes[-1].set_xlabel("azimuth [°]")
+    figure.colorbar(picture, ax=list(axes), label="range [m]", fraction=0.02, pad=0.01)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110)
+
+
+def point_clouds(scans: dict[str, Scan], path: Path, reach: float = 22.0) -> None:
+    """Draws scans as points coloured by height, side by side from one bird's-eye camera.
+
+    Args:
+        scans: What to draw by its caption.
+        path: A `.png` file.
+        reach: Metres around the sensor to show.
+    """
+    import pyvista  # here and not above: it takes a second to import
+
+    columns = 2
+    rows = -(-len(scans) // columns)
+    plotter = pyvista.Plotter(
+        off_screen=True, shape=(rows, columns), window_size=(1500, 560 * rows), border_color="white"
+    )
+    for number, (caption, scan) in enumerate(scans.items()):
+        plotter.subplot(number // columns, number % columns)
+        points = scan.points().cpu()
+        points = points[points[:, :2].norm(dim=1) < reach]
+        plotter.add_text(caption, font_size=11, color="black", position="upper_left")
+        if len(points):
+            cloud = pyvista.PolyData(points.numpy())
+            cloud["height [m]"] = points[:, 2].numpy()
+            plotter.add_mesh(
+                cloud, scalars="height [m]", cmap="viridis", clim=(-2, 4), point_size=2.5, show_scalar_bar=False
+            )
+        plotter.camera_position = [(-0.9 * reach, -0.75 * reach, 0.6 * reach), (0.0, 0.0, -1.0), (0, 0, 1)]
+        plotter.camera.zoom(1.4)
+    plotter.screenshot(path)
+    plotter.close()
