@@ -65,18 +65,6 @@ def _(features: torch.Tensor, queries: torch.Tensor, wrap: bool) -> tuple[torch.
     return features.new_empty(batch, count, 4, channels), features.new_empty(batch, count, 4, 2)
 
 
-@torch.library.custom_op("kernels::gather_neighbours_backward", mutates_args=())
-def _gather_neighbours_backward(
-    gradient: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool
-) -> torch.Tensor:
-    return adjoint_of_gather(gradient, queries, height, width, wrap)
-
-
-@_gather_neighbours_backward.register_fake
-def _(gradient: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
-    return gradient.new_empty(gradient.shape[0], height, width, gradient.shape[3])
-
-
 def _setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
     features, queries, ctx.wrap = inputs
     ctx.save_for_backward(queries)
@@ -87,7 +75,7 @@ def _backward(ctx: Any, gradient: torch.Tensor, _: torch.Tensor) -> tuple[torch.
     (queries,) = ctx.saved_tensors
     if not ctx.needs_input_grad[0]:
         return None, None, None
-    return _gather_neighbours_backward(gradient, queries, ctx.height, ctx.width, ctx.wrap), None, None
+    return adjoint_of_gather(gradient, queries, ctx.height, ctx.width, ctx.wrap), None, None
 
 
 _gather_neighbours.register_autograd(_backward, setup_context=_setup_context)

@@ -247,5 +247,5 @@ def gather_blend(
         blended, weights = reference.gather_blend(image, queries, scores, prior, wrap, area_floor)
     else:
         blended, weights = _gather_blend(image, queries, scores, PRIORS.index(prior), area_floor, wrap)
-    blended, weights = blended.reshape(*batch, -1), weights.reshape(*batch, *weights.shape[1:])
+    blended, weights = blended.reshape(*batch, *blended.shape[1:]), weights.reshape(*batch, *weights.shape[1:])
     return (blended, weights) if return_weights else blended

@@ -150,6 +150,7 @@ _number_cells = overload(_number_cells_kernel)
 _adjoint_of_gather = overload(_adjoint_of_gather_kernel)
 
 
+@torch.library.custom_op("kernels::adjoint_of_gather", mutates_args=())
 def adjoint_of_gather(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
     """Sums what the queries say of their neighbours into the pixels: the adjoint of gathering, as a gather.
 
@@ -181,6 +182,11 @@ def adjoint_of_gather(gradients: torch.Tensor, queries: torch.Tensor, height: in
         [pixels],
     )
     return pixels
+
+
+@adjoint_of_gather.register_fake
+def _(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
+    return gradients.new_empty(gradients.shape[0], height, width, gradients.shape[3])
 
 
 def channel_span(channels: int, device: torch.device) -> int:
@@ -218,8 +224,8 @@ def broadcast_batch(**named: tuple[torch.Tensor, int]) -> tuple[torch.Size, list
     except RuntimeError:
         shapes = ", ".join(f"{name} {tuple(shape)}" for name, shape in batches.items())
         raise ValueError(f"the batch dimensions do not broadcast: {shapes}") from None
-    folded = [
-        tensor.expand(*batch, *tensor.shape[tensor.ndim - own :]).reshape(-1, *tensor.shape[tensor.ndim - own :])
-        for tensor, own in named.values()
-    ]
+    folded = []
+    for tensor, own in named.values():
+        shape = tensor.shape[tensor.ndim - own :]
+        folded.append(tensor.expand(*batch, *shape).reshape(batch.numel(), *shape))
     return batch, folded

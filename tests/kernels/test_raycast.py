@@ -1,0 +1,189 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from kernels import Mesh
+
+# float32 of coordinates up to some tens of metres, through a few operations.
+METRES = 1e-4
+
+
+def plane(z=0.0, half=100.0):
+    corners = torch.tensor([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
+    return corners, torch.tensor([[0, 1, 2], [0, 2, 3]])
+
+
+def box(half=1.0):
+    corners = torch.tensor([[x, y, z] for x in (-half, half) for y in (-half, half) for z in (-half, half)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return corners, torch.tensor([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+
+
+def soup(count, seed=0):
+    """Small triangles at random places, wound at random."""
+    generator = torch.Generator().manual_seed(seed)
+    centres = torch.rand(count, 1, 3, generator=generator) * 20 - 10
+    vertices = (centres + torch.randn(count, 3, 3, generator=generator)).reshape(-1, 3)
+    return vertices, torch.arange(3 * count).view(count, 3)
+
+
+def unit_vectors(count, seed=0):
+    return torch.nn.functional.normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(seed)), dim=1)
+
+
+def brute_force(vertices, triangles, origins, directions, max_range):
+    """Möller-Trumbore for every ray and triangle, in float64: ranges and triangle numbers, 0 and -1 = none."""
+    a, b, c = vertices.double()[triangles].unbind(1)
+    directions = torch.nn.functional.normalize(directions.double(), dim=-1)
+    across = torch.linalg.cross(directions[:, None], (c - a)[None])
+    determinant = ((b - a)[None] * across).sum(-1)
+    to_origin = origins.double()[:, None] - a[None]
+    u = (to_origin * across).sum(-1) / determinant
+    along = torch.linalg.cross(to_origin, (b - a)[None].expand_as(to_origin))
+    v = (directions[:, None] * along).sum(-1) / determinant
+    t = ((c - a)[None] * along).sum(-1) / determinant
+    missed = ~((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t <= max_range))
+    nearest, number = t.masked_fill(missed, math.inf).min(1)
+    hit = nearest.isfinite()
+    return nearest.where(hit, 0.0), number.where(hit, -1)
+
+
+def test_plane(device):
+    mesh = Mesh(*plane(), device)
+    directions = unit_vectors(5000).to(device)
+    hits = mesh.cast(torch.tensor([0.0, 0.0, 2.0], device=device), directions, 50.0)
+    expected = 2.0 / -directions[:, 2]
+    seen = (directions[:, 2] < 0) & (expected <= 50)
+    torch.testing.assert_close(hits.range, expected.where(seen, 0.0), rtol=1e-5, atol=METRES)
+    torch.testing.assert_close(hits.cosine, directions[:, 2].abs().where(seen, 0.0), rtol=0, atol=1e-5)
+    assert ((hits.triangle >= 0) == seen).all()
+
+
+def test_sphere(device):
+    steps = 200
+    theta, phi = torch.meshgrid(torch.linspace(0, math.pi, steps), torch.linspace(0, math.tau, 2 * steps), indexing="ij")
+    vertices = 3 * torch.stack([theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()], -1).view(-1, 3)
+    corner = (torch.arange(steps - 1)[:, None] * 2 * steps + torch.arange(2 * steps - 1)).reshape(-1)
+    triangles = torch.cat(
+        [torch.stack([corner, corner + 1, corner + 2 * steps], 1),
+         torch.stack([corner + 1, corner + 2 * steps + 1, corner + 2 * steps], 1)]
+    )
+    hits = Mesh(vertices, triangles, device).cast(torch.zeros(3, device=device), unit_vectors(2000).to(device), 10.0)
+    # Chords of the facets lie inside the sphere by at most r (1 - cos(step / 2)).
+    sagitta = 3 * (1 - math.cos(math.pi / steps))
+    assert hits.range.min() >= 3 - 2 * sagitta - METRES
+    assert hits.range.max() <= 3 + METRES
+    assert hits.cosine.min() > 0.99
+
+
+def test_rays_along_the_axes_hit(device):
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).to(device)
+    hits = Mesh(*box(), device).cast(torch.zeros(3, device=device), axes, 10.0)
+    torch.testing.assert_close(hits.range, torch.ones(6, device=device))
+    torch.testing.assert_close(hits.cosine, torch.ones(6, device=device))
+    # From outside, through the same axes and a whole row of origins in the plane of an edge.
+    hits = Mesh(*box(), device).cast(-3 * axes, axes, 10.0)
+    torch.testing.assert_close(hits.range, torch.full((6,), 2.0, device=device))
+
+
+def test_elevation_zero_and_azimuth_ninety_hit_a_town_like_grid(device):
+    walls = [box(0.5) for _ in range(64)]
+    vertices = torch.cat([v + torch.tensor([5.0 * (i % 8), 5.0 * (i // 8), 0]) for i, (v, _) in enumerate(walls)])
+    triangles = torch.cat([t + 8 * i for i, (_, t) in enumerate(walls)])
+    mesh = Mesh(vertices, triangles, device)
+    origins = torch.stack([torch.arange(8.0) * 5, torch.full((8,), -10.0), torch.zeros(8)], 1).to(device)
+    hits = mesh.cast(origins, torch.tensor([0.0, 1.0, 0.0], device=device), 100.0)
+    torch.testing.assert_close(hits.range, torch.full((8,), 9.5, device=device))
+
+
+def test_matches_brute_force_on_a_triangle_soup(device, poisoned):
+    vertices, triangles = soup(300)
+    origins = (torch.rand(3000, 3, generator=torch.Generator().manual_seed(1)) - 0.5) * 20
+    directions = unit_vectors(3000, seed=2) * torch.linspace(0.01, 100, 3000)[:, None]
+    hits = Mesh(vertices, triangles, device).cast(origins.to(device), directions.to(device), 8.0)
+    ranges, numbers = brute_force(vertices, triangles, origins, directions, 8.0)
+    # Rays within rounding of a triangle's rim or of the maximum range may go either way.
+    differ = (hits.triangle.cpu() != numbers)
+    assert differ.sum() <= 3
+    torch.testing.assert_close(hits.range.cpu().double()[~differ], ranges[~differ], rtol=1e-4, atol=METRES)
+    assert (ranges > 0).float().mean() > 0.1  # enough hits to mean something
+
+
+def test_back_faces_count(device):
+    vertices, triangles = plane(z=1.0)
+    up = torch.tensor([0.1, 0.2, 1.0], device=device)
+    origin = torch.zeros(3, device=device)
+    hits = [Mesh(vertices, t, device).cast(origin, up, 10.0) for t in (triangles, triangles.flip(1))]
+    assert hits[0].range > 0
+    torch.testing.assert_close(hits[0].range, hits[1].range)
+    torch.testing.assert_close(hits[0].cosine, hits[1].cosine)
+
+
+def test_degenerate_triangles_do_no_harm(device):
+    vertices, triangles = plane()
+    points = torch.tensor([[0.0, 0, 1], [0, 0, 1], [0, 0, 1], [1, 0, 1], [2, 0, 1]])
+    vertices = torch.cat([vertices, points])
+    degenerate = torch.tensor([[4, 5, 6], [4, 7, 8], [4, 4, 7]])
+    mesh = Mesh(vertices, torch.cat([degenerate, triangles]), device)
+    down = torch.tensor([0.0, 0.0, -1.0], device=device)
+    hits = mesh.cast(torch.tensor([[0.0, 0, 3], [1, 0, 3], [0.5, 0, 3]], device=device), down, 10.0)
+    assert hits.range.tolist() == [3, 3, 3]
+    assert (hits.triangle >= 3).all()
+
+
+def test_accepts_numpy_integers_of_any_width_and_keeps_a_copy(device):
+    vertices, triangles = (a.numpy() for a in plane())
+    mesh = Mesh(vertices.astype(np.float64), triangles.astype(np.uint8), device)
+    vertices += 1000
+    hit = mesh.cast(torch.tensor([0.0, 0, 2], device=device), torch.tensor([0.0, 0, -1], device=device), 5.0)
+    assert hit.range == 2
+    assert hit.range.shape == ()
+
+
+def test_shapes_broadcast_and_no_rays(device):
+    mesh = Mesh(*plane(), device)
+    hits = mesh.cast(torch.ones(5, 1, 3, device=device), -torch.ones(4, 3, device=device), 9.0)
+    assert hits.range.shape == hits.triangle.shape == hits.cosine.shape == (5, 4)
+    assert mesh.cast(torch.ones(0, 3, device=device), torch.ones(3, device=device), 9.0).range.shape == (0,)
+
+
+def bad_meshes():
+    vertices, triangles = plane()
+    torn = vertices.clone()
+    torn[1, 2] = math.nan
+    return {
+        r"vertices has shape \(0, 3\)": (vertices[:0], triangles),
+        r"triangles has shape \(0, 3\)": (vertices, triangles[:0]),
+        r"vertices has shape \(4, 2\)": (vertices[:, :2], triangles),
+        "vertices holds 1 NaN or infinite of 4": (torn, triangles),
+        r"triangles runs from 0 to 4; it should lie in 0\.\.3": (vertices, triangles + (triangles == 3)),
+        "triangles runs from -1": (vertices, triangles - 1),
+        "triangles is torch.float32": (vertices, triangles.float()),
+        "vertices is torch.int64": (vertices.long(), triangles),
+    }
+
+
+@pytest.mark.parametrize("message", bad_meshes())
+def test_bad_meshes_are_refused(message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        Mesh(*bad_meshes()[message])
+
+
+@pytest.mark.parametrize(
+    ("origins", "directions", "max_range", "message"),
+    [
+        (torch.zeros(3), torch.zeros(2, 3), 5.0, "directions holds a direction of length 0"),
+        (torch.zeros(3), torch.tensor([1.0, math.nan, 0]), 5.0, "directions holds NaN"),
+        (torch.tensor([0, 0, math.inf]), torch.ones(3), 5.0, "origins holds NaN or infinite"),
+        (torch.zeros(2), torch.ones(3), 5.0, r"origins has shape \(2,\)"),
+        (torch.zeros(3), torch.ones(3).int(), 5.0, "directions is torch.int32"),
+        (torch.zeros(3), torch.ones(3), 0.0, r"max_range is 0\.0"),
+        (torch.zeros(3), torch.ones(3), math.nan, "max_range is nan"),
+        ([0.0, 0.0, 0.0], torch.ones(3), 5.0, "origins is list"),
+    ],
+)
+def test_bad_rays_are_refused(origins, directions, max_range, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        Mesh(*plane()).cast(origins, directions, max_range)
