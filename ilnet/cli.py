@@ -22,10 +22,17 @@ def cli() -> None:
 @click.option("--at", type=(float, float, float), metavar="X Y Z", help="Position of the sensor in the mesh [m].")
 @click.option("--scan", type=Path, metavar="FILE", help="Decimate this scan, and judge against all of its rows.")
 @click.option("--rows", type=int, default=16, show_default=True, help="Beams of the scan to keep.")
+@click.option("--sensor", metavar="NAME", help="Preset with the scan's angles, where the file does not name them.")
 @click.option("--out", type=Path, default=Path("demo_output"), show_default=True, help="Folder for the pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the table.")
 def demo(
-    mesh: Path | None, at: tuple[float, float, float] | None, scan: Path | None, rows: int, out: Path, as_json: bool
+    mesh: Path | None,
+    at: tuple[float, float, float] | None,
+    scan: Path | None,
+    rows: int,
+    sensor: str | None,
+    out: Path,
+    as_json: bool,
 ) -> None:
     """Upsample a scan with every method: a table, pictures, a point cloud."""
     if mesh and scan:
@@ -37,7 +44,7 @@ def demo(
     if mesh and at:
         pair, source = demonstration.from_mesh(mesh, at), mesh.name
     elif scan:
-        pair, source = demonstration.from_scan(scan, rows), scan.name
+        pair, source = demonstration.from_scan(scan, rows, sensor), scan.name
     else:
         pair, source = demonstration.from_town(), demonstration.TOWN
     result = demonstration.demo(*pair, out, source)

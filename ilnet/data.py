@@ -1,4 +1,4 @@
-"""Training data: rays at continuous directions, cast while the network trains (the paper, Sec. III-A, stored images)."""
+"""Training data: rays at continuous directions, cast while the network trains (paper, Sec. III-A: intractable)."""
 
 import math
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from ilnet.scan import Scan
 from ilnet.sensor import Sensor, angles_to_directions
 from kernels import Mesh
 
-__all__ = ["Batch", "ContinuousRays", "Street", "held_out_scans"]
+__all__ = ["Batch", "ContinuousRays", "Street", "held_out_scans", "street"]
 
 # Metres above the lane, and how it varies from car to car.
 SENSOR_HEIGHT = 1.8
@@ -44,6 +44,10 @@ class Street(NamedTuple):
     headings: torch.Tensor
     """(N,) rad."""
 
+    def pose(self, number: int) -> torch.Tensor:
+        """The pose (4, 4) of a sensor that looks ahead above waypoint `number`."""
+        return simulate.pose(self.waypoints[number] + torch.tensor([0, 0, SENSOR_HEIGHT]), self.headings[number])
+
 
 def street(name: str, seed: int, device: torch.device | str = "cpu") -> Street:
     """Builds a town and its ray casting mesh."""
@@ -60,9 +64,7 @@ def held_out_scans(street: Street, count: int, sensors: list[Sensor]) -> list[li
         For each waypoint one scan per sensor.
     """
     chosen = torch.linspace(0, len(street.waypoints) - 1, count + 2)[1:-1].long().tolist()
-    up = torch.tensor([0.0, 0.0, SENSOR_HEIGHT])
-    poses = [simulate.pose(street.waypoints[i] + up, street.headings[i]) for i in chosen]
-    return [[simulate.simulate(street.mesh, sensor, pose) for sensor in sensors] for pose in poses]
+    return [[simulate.simulate(street.mesh, sensor, street.pose(i)) for sensor in sensors] for i in chosen]
 
 
 class ContinuousRays(IterableDataset):
@@ -108,9 +110,8 @@ class ContinuousRays(IterableDataset):
             at[:, 2] += SENSOR_HEIGHT + uniform(-_HEIGHT_JITTER, _HEIGHT_JITTER, len(chosen))
             turn = uniform(-math.pi, math.pi, len(chosen))
             tilt = uniform(-_TILT_JITTER, _TILT_JITTER, 2, len(chosen))
-            pose = simulate.pose(at, turn, *tilt).to(street.mesh.device)
-            directions = rays[chosen].to(street.mesh.device) @ pose[:, :3, :3].transpose(1, 2)
-            ranges[chosen] = street.mesh.cast(pose[:, None, :3, 3], directions, sensor.max_range).range.cpu()
-        ranges = ranges.where(ranges >= sensor.min_range, sensor.norm_range)
+            pose = simulate.pose(at, turn, *tilt)
+            ranges[chosen] = simulate.measure(street.mesh, sensor, pose, rays[chosen]).cpu()
+        ranges = ranges.where(ranges > 0, sensor.norm_range)
         image, ranges = ranges.split([grid.shape[1], self.queries], 1)
         return Batch(image.unflatten(1, sensor.shape), sensor.locate(elevation, azimuth), ranges.contiguous())

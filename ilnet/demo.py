@@ -1,11 +1,12 @@
 """The whole path once: a scan, its upsampled versions, their figures and pictures."""
 
+import math
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ilnet import data, metrics, models, plot, simulate, towns
+from ilnet import data, meshes, metrics, models, plot, simulate
 from ilnet import scan as scans
 from ilnet.scan import Scan
 from ilnet.sensor import preset
@@ -30,10 +31,8 @@ def _pair(mesh: Mesh, pose: torch.Tensor) -> tuple[Scan, Scan]:
 
 def from_town() -> tuple[Scan, Scan]:
     """A scan of 16×1024 in the embedded town, and what 128×2048 rays measure there."""
-    town = towns.build(TOWN)
-    position = torch.tensor(town.waypoints[_WAYPOINT]) + torch.tensor([0.0, 0.0, data.SENSOR_HEIGHT])
-    mesh = Mesh(town.vertices, town.triangles, _device())
-    return _pair(mesh, simulate.pose(position, torch.tensor(town.headings[_WAYPOINT])))
+    street = data.street(TOWN, seed=0, device=_device())
+    return _pair(street.mesh, street.pose(_WAYPOINT))
 
 
 def from_mesh(path: Path, at: tuple[float, float, float]) -> tuple[Scan, Scan]:
@@ -47,7 +46,9 @@ def from_mesh(path: Path, at: tuple[float, float, float]) -> tuple[Scan, Scan]:
         FileNotFoundError: If there is no such file.
         ValueError: If it is not a mesh, or nothing is in range of the position.
     """
-    vertices, triangles = simulate.read_mesh(path)
+    if not all(map(math.isfinite, at)):
+        raise ValueError(f"--at is {at}; it should be three finite numbers, metres in the mesh")
+    vertices, triangles = meshes.read(path)
     scan, truth = _pair(Mesh(vertices, triangles, _device()), simulate.pose(at))
     if not scan.ranges.any():
         low, high = (", ".join(f"{c:.1f}" for c in corner) for corner in (vertices.min(0), vertices.max(0)))
@@ -57,18 +58,19 @@ def from_mesh(path: Path, at: tuple[float, float, float]) -> tuple[Scan, Scan]:
     return scan, truth
 
 
-def from_scan(path: Path, rows: int) -> tuple[Scan, Scan]:
+def from_scan(path: Path, rows: int, sensor: str | None = None) -> tuple[Scan, Scan]:
     """A measured scan with only some of its beams, and the whole of it.
 
     Args:
-        path: A scan file that names its angles; see `ilnet.scan.read`.
+        path: A scan file; see `ilnet.scan.read`.
         rows: Beams to keep.
+        sensor: Preset with the file's angles, where the file does not name them.
 
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If it is not a scan, or cannot be decimated so.
     """
-    truth = scans.read(path)
+    truth = scans.read(path, preset(sensor) if sensor else None)
     truth = Scan(truth.ranges.to(_device()), truth.sensor)
     scan = truth.decimate(rows)
     if rows == truth.sensor.shape[0]:
@@ -93,15 +95,13 @@ def demo(scan: Scan, truth: Scan, out: Path, source: str) -> dict[str, Any]:
     out.mkdir(parents=True, exist_ok=True)
     figures, upsampled = {}, {}
     for name in METHODS:
-        model = models.load(name).to(scan.ranges.device)
-        ranges = model.ranges(scan, truth.sensor)
+        ranges = models.load(name).to(scan.ranges.device).ranges(scan, truth.sensor)
         figures[name] = metrics.compare(ranges, truth)
-        upsampled[name] = model.upsample(scan, truth.sensor)
+        upsampled[name] = models.returns(ranges, scan.sensor, truth.sensor)
     size = {"input": "x".join(map(str, scan.sensor.shape)), "output": "x".join(map(str, truth.sensor.shape))}
     pictures = {f"input, {size['input']}": scan, **upsampled, f"truth, {size['output']}": truth}
     plot.range_images(pictures, out / "range_images.png", f"{source}: range images")
     plot.range_images(pictures, out / "range_images_sector.png", f"{source}: 90° of them", sector=90)
-    chosen = [n for n in pictures if n not in ("nearest", "bilinear-inverse")]
-    plot.point_clouds({n: pictures[n] for n in chosen}, out / "points.png")
+    plot.point_clouds({n: s for n, s in pictures.items() if n != "nearest"}, out / "points.png")
     scans.write(out / "iln-prior.ply", upsampled["iln-prior"])
     return {"methods": figures, "input": size["input"], "output": size["output"]}

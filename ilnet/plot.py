@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
 
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
@@ -27,8 +28,8 @@ def _top_down(scan: Scan) -> tuple:
 
 def _degrees(sensor: Sensor) -> list[float]:
     """Left, right, bottom and top of the picture in degrees."""
-    azimuths, elevations = (sorted(a * 57.29577951308232) for a in (sensor.azimuths, sensor.elevations))
-    return [azimuths[-1], azimuths[0], elevations[0], elevations[-1]]
+    azimuths, elevations = np.rad2deg(sensor.azimuths), np.rad2deg(sensor.elevations)
+    return [azimuths.max(), azimuths.min(), elevations.min(), elevations.max()]
 
 
 def range_images(scans: dict[str, Scan], path: Path, title: str, sector: float | None = None) -> None:
@@ -40,7 +41,7 @@ def range_images(scans: dict[str, Scan], path: Path, title: str, sector: float |
         title: Of the whole.
         sector: Degrees of azimuth to show, centred on the sensor's middle column; all where None.
     """
-    figure = matplotlib.figure.Figure(figsize=(12, 1.35 * len(scans) + 0.8), layout="constrained")
+    figure = Figure(figsize=(12, 1.35 * len(scans) + 0.8), layout="constrained")
     axes = figure.subplots(len(scans), 1, sharex=True, squeeze=False)[:, 0]
     farthest = min(max(float(scan.ranges.max()) for scan in scans.values()), 60.0)
     for axis, (caption, scan) in zip(axes, scans.items(), strict=True):
@@ -59,8 +60,8 @@ def range_images(scans: dict[str, Scan], path: Path, title: str, sector: float |
     figure.savefig(path, dpi=110)
 
 
-def point_clouds(scans: dict[str, Scan], path: Path, reach: float = 22.0) -> None:
-    """Draws scans as points coloured by height, side by side from one bird's-eye camera.
+def point_clouds(scans: dict[str, Scan], path: Path, reach: float = 35.0) -> None:
+    """Draws scans as points coloured by height, side by side, from one camera above and behind the sensor.
 
     Args:
         scans: What to draw by its caption.
@@ -69,23 +70,23 @@ def point_clouds(scans: dict[str, Scan], path: Path, reach: float = 22.0) -> Non
     """
     import pyvista  # here and not above: it takes a second to import
 
-    columns = 2
-    rows = -(-len(scans) // columns)
-    plotter = pyvista.Plotter(
-        off_screen=True, shape=(rows, columns), window_size=(1500, 560 * rows), border_color="white"
-    )
-    for number, (caption, scan) in enumerate(scans.items()):
-        plotter.subplot(number // columns, number % columns)
-        points = scan.points().cpu()
-        points = points[points[:, :2].norm(dim=1) < reach]
-        plotter.add_text(caption, font_size=11, color="black", position="upper_left")
-        if len(points):
-            cloud = pyvista.PolyData(points.numpy())
-            cloud["height [m]"] = points[:, 2].numpy()
-            plotter.add_mesh(
-                cloud, scalars="height [m]", cmap="viridis", clim=(-2, 4), point_size=2.5, show_scalar_bar=False
-            )
-        plotter.camera_position = [(-0.9 * reach, -0.75 * reach, 0.6 * reach), (0.0, 0.0, -1.0), (0, 0, 1)]
-        plotter.camera.zoom(1.4)
-    plotter.screenshot(path)
-    plotter.close()
+    # Without a screen VTK warns of its absence, then renders all the same.
+    with pyvista.vtk_verbosity("off"):
+        columns = 3
+        rows = -(-len(scans) // columns)
+        plotter = pyvista.Plotter(off_screen=True, shape=(rows, columns), window_size=[1800, 480 * rows], border=False)
+        for number, (caption, scan) in enumerate(scans.items()):
+            plotter.subplot(number // columns, number % columns)
+            points = scan.points().cpu()
+            points = points[points[:, :2].norm(dim=1) < reach]
+            plotter.add_text(caption, font_size=12, color="black", position="upper_edge")
+            if len(points):
+                cloud = pyvista.PolyData(points.numpy())
+                cloud["height [m]"] = points[:, 2].numpy()
+                plotter.add_mesh(
+                    cloud, scalars="height [m]", cmap="viridis", clim=(-2, 4), point_size=2, show_scalar_bar=False
+                )
+            plotter.camera_position = [(-0.9 * reach, -0.35 * reach, 0.55 * reach), (0.2 * reach, 0.0, -1.0), (0, 0, 1)]
+            plotter.camera.view_angle = 38
+        plotter.screenshot(path)
+        plotter.close()

@@ -1,16 +1,12 @@
 """A sensor, a pose and a mesh make a scan."""
 
-import math
-from pathlib import Path
-
-import numpy as np
 import torch
 
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 from kernels import Mesh
 
-__all__ = ["pose", "read_mesh", "simulate"]
+__all__ = ["measure", "pose", "simulate"]
 
 
 def pose(position: torch.Tensor | tuple[float, float, float], yaw=0.0, pitch=0.0, roll=0.0) -> torch.Tensor:
@@ -38,6 +34,24 @@ def pose(position: torch.Tensor | tuple[float, float, float], yaw=0.0, pitch=0.0
     return torch.stack(entries, -1).unflatten(-1, (4, 4))
 
 
+def measure(mesh: Mesh, sensor: Sensor, pose: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+    """Measures ranges along any directions, with the range limits of a sensor.
+
+    Args:
+        mesh: The world, in metres.
+        sensor: Whose limits hold.
+        pose: (..., 4, 4) transforms from the sensor frame to the world.
+        directions: (..., N, 3) unit vectors in the sensor frame.
+
+    Returns:
+        (..., N) float32 metres on the mesh's device; 0 where nothing is met between minimum and maximum range.
+    """
+    pose = pose.to(mesh.device)
+    turned = directions.to(mesh.device).double() @ pose[..., :3, :3].mT
+    ranges = mesh.cast(pose[..., None, :3, 3], turned, sensor.max_range).range
+    return ranges.where(ranges >= sensor.min_range, 0.0)
+
+
 def simulate(mesh: Mesh, sensor: Sensor, pose: torch.Tensor) -> Scan:
     """Casts every ray of a sensor at a mesh.
 
@@ -49,40 +63,4 @@ def simulate(mesh: Mesh, sensor: Sensor, pose: torch.Tensor) -> Scan:
     Returns:
         The scan; 0 where nothing is met between the sensor's minimum and maximum range.
     """
-    pose = pose.to(mesh.device)
-    directions = (sensor.directions().to(mesh.device).double() @ pose[:3, :3].T).float()
-    ranges = mesh.cast(pose[:3, 3].float(), directions, sensor.max_range).range
-    return Scan(ranges.where(ranges >= sensor.min_range, 0.0), sensor)
-
-
-def read_mesh(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the triangles of any mesh file that PyVista reads; other polygons are cut into triangles.
-
-    Args:
-        path: The file; metres, z up.
-
-    Returns:
-        vertices: (V, 3) float32.
-        triangles: (F, 3) int32.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is not a mesh, or holds no triangle.
-    """
-    import pyvista  # here and not above: it takes a second to import
-
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; give the path of a mesh")
-    try:
-        with pyvista.vtk_verbosity("off"):  # VTK writes to stderr and carries on with an empty mesh
-            mesh = pyvista.wrap(pyvista.read(path)).extract_surface(algorithm=None).triangulate()
-    except Exception as error:  # PyVista and its readers raise whatever they like
-        raise ValueError(f"{path}: not a mesh that PyVista reads ({type(error).__name__}: {error})") from error
-    triangles = np.asarray(mesh.regular_faces if mesh.n_cells else np.empty((0, 3)), dtype=np.int32)
-    vertices = np.asarray(mesh.points, dtype=np.float32)
-    if len(triangles) == 0:
-        raise ValueError(f"{path}: holds no triangle; give a mesh with faces, not a point cloud or another kind of file")
-    if not math.isfinite(float(vertices.sum())):
-        raise ValueError(f"{path}: holds NaN or infinite vertices; clean the mesh first")
-    return vertices, triangles
+    return Scan(measure(mesh, sensor, pose, sensor.directions().view(-1, 3)).view(sensor.shape), sensor)

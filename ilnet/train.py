@@ -1,6 +1,6 @@
 """Training with Lightning: L1 on normalised ranges, rays at continuous directions (paper, Sec. III-B)."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,7 @@ class Training(lightning.LightningModule):
         for name, value in metrics.compare(self.model.ranges(scan, truth.sensor).float(), truth).items():
             self.log(f"val/{name}", value, prog_bar=name in ("mae", "iou"), batch_size=1)
 
-    def configure_optimizers(self) -> dict[str, Any]:
+    def configure_optimizers(self) -> Any:
         """Adam; the rate warms up and decays to 0."""
         optimizer = torch.optim.Adam(self.parameters(), lr=self.rate)
         steps = int(self.trainer.estimated_stepping_batches)
@@ -102,7 +102,14 @@ def train(
 
     Returns:
         The last figures on held-out scans.
+
+    Raises:
+        ValueError: If there is no such model or preset.
     """
+    if preset_name not in PRESETS:
+        raise ValueError(f"unknown preset {preset_name!r}; known are {', '.join(PRESETS)}")
+    if name not in models.TRAINABLE:
+        raise ValueError(f"model {name!r} cannot be trained; these can: {', '.join(models.TRAINABLE)}")
     size = PRESETS[preset_name]
     steps = size.steps if steps is None else steps
     lightning.seed_everything(seed, verbose=False)
@@ -130,11 +137,18 @@ def train(
     trainer.fit(
         training,
         DataLoader(rays, batch_size=None),
-        DataLoader(range(len(held_out)), batch_size=None),
+        DataLoader(range(len(held_out)), batch_size=None),  # type: ignore[arg-type]
         ckpt_path=last if last.exists() else None,
     )
     figures = {key: round(float(value), 4) for key, value in trainer.callback_metrics.items() if key.startswith("val/")}
     models.save(
-        model, out / f"{name}.safetensors", name, arguments, preset=asdict(size), steps=steps, seed=seed, held_out=figures
+        model,
+        out / f"{name}.safetensors",
+        name,
+        arguments,
+        preset=preset_name,
+        steps=steps,
+        seed=seed,
+        held_out=figures,
     )
     return figures

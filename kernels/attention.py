@@ -25,6 +25,7 @@ __all__ = ["neighbour_attention"]
 
 _Q, _K, _V = wp.constant(0), wp.constant(1), wp.constant(2)
 
+
 @wp.func
 def _probabilities(qkv: wp.array4d[Any], n: int, h: int, scale: Any):
     """P (4, 4) of head h of query n."""
@@ -174,8 +175,5 @@ def neighbour_attention(qkv: torch.Tensor, heads: int, backend: str = "warp") ->
         )
     batch, width = qkv.shape[:-2], qkv.shape[-1] // (3 * heads)
     qkv = qkv.reshape(-1, 12, heads, width)
-    if backend == "torch":
-        attended = reference.neighbour_attention(qkv)
-    else:
-        attended = _neighbour_attention(qkv.contiguous())
+    attended = reference.neighbour_attention(qkv) if backend == "torch" else _neighbour_attention(qkv.contiguous())
     return attended.reshape(*batch, 4, heads * width)

@@ -7,7 +7,7 @@ import warp as wp
 
 from kernels import reference
 from kernels.launch import check_backend, launch, overload
-from kernels.neighbours import broadcast_batch, channel_span, check_queries, neighbour, offset, adjoint_of_gather
+from kernels.neighbours import adjoint_of_gather, broadcast_batch, channel_span, check_queries, neighbour, offset
 
 __all__ = ["gather_neighbours"]
 

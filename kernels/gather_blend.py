@@ -13,14 +13,15 @@ The gradients follow from ∂w_t/∂s_u = w_t (δ_tu - w_u):
     ∂r̂/∂r_t = w_t + w_t (r_t - r̂) · (-1 / r_t) = w_t r̂ / r_t    the perspective prior
 """
 
-from typing import Any
+from typing import Any, Literal
+from typing import overload as overload_types
 
 import torch
 import warp as wp
 
 from kernels import reference
 from kernels.launch import check_backend, launch, overload
-from kernels.neighbours import area, broadcast_batch, check_queries, neighbour, adjoint_of_gather
+from kernels.neighbours import adjoint_of_gather, area, broadcast_batch, check_queries, neighbour
 from kernels.reference import PRIORS, RANGE_FLOOR
 
 __all__ = ["gather_blend"]
@@ -183,6 +184,34 @@ def _backward(ctx: Any, adj_blended: torch.Tensor, adj_weights: torch.Tensor) ->
 
 
 _gather_blend.register_autograd(_backward, setup_context=_setup_context)
+
+
+@overload_types
+def gather_blend(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    scores: torch.Tensor,
+    prior: str = ...,
+    wrap: bool = ...,
+    *,
+    area_floor: float = ...,
+    return_weights: Literal[False] = ...,
+    backend: str = ...,
+) -> torch.Tensor: ...
+
+
+@overload_types
+def gather_blend(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    scores: torch.Tensor,
+    prior: str = ...,
+    wrap: bool = ...,
+    *,
+    area_floor: float = ...,
+    return_weights: Literal[True],
+    backend: str = ...,
+) -> tuple[torch.Tensor, torch.Tensor]: ...
 
 
 def gather_blend(

@@ -1,5 +1,7 @@
 """The one way a kernel is launched: torch tensors in, on their device, stream and CPU cores."""
 
+import functools
+import itertools
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -8,7 +10,7 @@ from typing import Any
 import torch
 import warp as wp
 
-__all__ = ["BACKENDS", "check_backend", "launch", "overload"]
+__all__ = ["BACKENDS", "check_backend", "initialise", "launch", "overload"]
 
 BACKENDS = ("warp", "torch")
 
@@ -48,6 +50,23 @@ def _pool(cores: int) -> ThreadPoolExecutor:
         if cores not in _pools:
             _pools[cores] = ThreadPoolExecutor(cores, thread_name_prefix="kernels")
         return _pools[cores]
+
+
+@functools.cache
+def initialise() -> None:
+    """Starts Warp, once; everything that calls Warp before a launch calls this first."""
+    if torch.cuda.is_available():
+        wp.init()
+        return
+    # Without a driver Warp's native library warns on stderr at every start; who has no GPU knows.
+    stderr = os.dup(2)
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        wp.init()
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
 
 
 def check_backend(backend: str) -> None:
@@ -97,6 +116,7 @@ def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[tor
     """
     if threads == 0:
         return
+    initialise()
     arguments = [
         wp.from_torch(a.detach(), requires_grad=False, return_ctype=True) if isinstance(a, torch.Tensor) else a
         for a in (*inputs, *outputs)
@@ -116,7 +136,6 @@ def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[tor
         run((0, threads))
         return
     with _lock:  # compiled or loaded once, before the cores ask for it together
-        wp.init()
         kernel.module.load("cpu")
     edges = [threads * i // pieces for i in range(pieces + 1)]
-    list(_pool(cores).map(run, zip(edges[:-1], edges[1:], strict=True)))
+    list(_pool(cores).map(run, itertools.pairwise(edges)))

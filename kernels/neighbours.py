@@ -151,7 +151,9 @@ _adjoint_of_gather = overload(_adjoint_of_gather_kernel)
 
 
 @torch.library.custom_op("kernels::adjoint_of_gather", mutates_args=())
-def adjoint_of_gather(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
+def adjoint_of_gather(
+    gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool
+) -> torch.Tensor:
     """Sums what the queries say of their neighbours into the pixels: the adjoint of gathering, as a gather.
 
     Each pixel reads the queries of the cells around it, in a fixed order. A scatter would need atomics: not
@@ -199,7 +201,9 @@ def check_queries(queries: torch.Tensor, like: torch.Tensor, name: str) -> None:
     if not isinstance(queries, torch.Tensor):
         raise TypeError(f"queries is a {type(queries).__name__}; it should be a torch.Tensor (..., Q, 2)")
     if queries.ndim < 2 or queries.shape[-1] != 2:
-        raise ValueError(f"queries has shape {tuple(queries.shape)}; it should be (..., Q, 2): row and column in pixels")
+        raise ValueError(
+            f"queries has shape {tuple(queries.shape)}; it should be (..., Q, 2): row and column in pixels"
+        )
     if not queries.is_floating_point():
         raise TypeError(f"queries is {queries.dtype}; it should be a floating-point tensor of pixel coordinates")
     if queries.device != like.device:

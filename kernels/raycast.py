@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from kernels.launch import launch
+from kernels.launch import initialise, launch
 
 __all__ = ["Hits", "Mesh"]
 
@@ -84,16 +84,19 @@ class Mesh:
         if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
             raise TypeError(f"triangles is {faces.dtype}; it should be an integer type")
         if not (finite := points.isfinite().all(1)).all():
-            raise ValueError(f"vertices holds {int((~finite).sum())} NaN or infinite of {len(points)}; remove them first")
+            raise ValueError(
+                f"vertices holds {int((~finite).sum())} NaN or infinite of {len(points)}; remove them first"
+            )
         if faces.min() < 0 or faces.max() >= len(points):
             raise ValueError(
                 f"triangles runs from {int(faces.min())} to {int(faces.max())}; it should lie in 0..{len(points) - 1}"
             )
+        initialise()
         self.device = torch.device(device)
-        on = {"device": str(self.device), "copy": True}
+        name = str(self.device)
         self._mesh = wp.Mesh(
-            points=wp.array(points.detach().cpu().float().numpy(), dtype=wp.vec3, **on),
-            indices=wp.array(faces.detach().cpu().int().numpy().reshape(-1), dtype=wp.int32, **on),
+            points=wp.array(points.detach().cpu().float().numpy(), dtype=wp.vec3, device=name, copy=True),
+            indices=wp.array(faces.detach().cpu().int().numpy().reshape(-1), dtype=wp.int32, device=name, copy=True),
         )
 
     def cast(self, origins: torch.Tensor, directions: torch.Tensor, max_range: float) -> Hits:

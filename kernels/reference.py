@@ -62,11 +62,9 @@ def areas(queries: torch.Tensor) -> torch.Tensor:
     return torch.stack([(1 - fr) * (1 - fc), (1 - fr) * fc, fr * (1 - fc), fr * fc], -1)
 
 
-def gather_neighbours(
-    features: torch.Tensor, queries: torch.Tensor, wrap: bool
-) -> tuple[torch.Tensor, torch.Tensor]:
+def gather_neighbours(features: torch.Tensor, queries: torch.Tensor, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
     """`kernels.gather_neighbours` on features (B, C, H, W) and queries (B, Q, 2)."""
-    rows, columns, offsets = neighbours(queries, *features.shape[2:], wrap)
+    rows, columns, offsets = neighbours(queries, features.shape[2], features.shape[3], wrap)
     image = torch.arange(len(features), device=features.device).view(-1, 1, 1)
     return features.movedim(1, 3)[image, rows, columns], offsets
 

@@ -6,7 +6,7 @@ from torch import nn
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 
-__all__ = ["Model"]
+__all__ = ["Model", "returns"]
 
 # Queries decoded at a time: the activations of so many fit the cache of a CPU core.
 _CHUNK = {"cpu": 4096, "cuda": 65536}
@@ -79,7 +79,20 @@ class Model(nn.Module):
             A scan of `sensor`. Rays outside the field of view of the scan's sensor, and those predicted beyond
             the maximum or below the minimum range of `sensor`, hold no return.
         """
-        ranges = self.ranges(scan, sensor)
-        seen = scan.sensor.contains(scan.sensor.grid_queries(sensor)).to(ranges.device)
-        valid = seen & (ranges >= sensor.min_range) & (ranges <= sensor.max_range)
-        return Scan(ranges.where(valid, 0.0), sensor)
+        return returns(self.ranges(scan, sensor), scan.sensor, sensor)
+
+
+def returns(ranges: torch.Tensor, source: Sensor, sensor: Sensor) -> Scan:
+    """Tells returns from no return in predicted ranges.
+
+    Args:
+        ranges: (H, W) metres, of the rays of `sensor`.
+        source: The sensor they were predicted from.
+        sensor: The sensor they were predicted for.
+
+    Returns:
+        A scan of `sensor`; 0 outside the field of view of `source` and outside the range limits of `sensor`.
+    """
+    seen = source.contains(source.grid_queries(sensor)).to(ranges.device)
+    valid = seen & (ranges >= sensor.min_range) & (ranges <= sensor.max_range)
+    return Scan(ranges.where(valid, 0.0), sensor)

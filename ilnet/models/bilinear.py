@@ -12,6 +12,7 @@ class Nearest(Model):
     """The range of the pixel nearest to the query."""
 
     def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+        """Answers queries (B, Q, 2) with ranges (B, Q) [m]."""
         # A query moved onto a pixel centre has that pixel as its only neighbour with an area.
         return gather_blend(image, queries.round(), queries.new_zeros(*queries.shape[:-1], 4), "bilinear", wrap)
 
@@ -28,4 +29,5 @@ class Bilinear(Model):
         self.prior = "perspective" if inverse else "bilinear"
 
     def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+        """Answers queries (B, Q, 2) with ranges (B, Q) [m]."""
         return gather_blend(image, queries, queries.new_zeros(*queries.shape[:-1], 4), self.prior, wrap)

@@ -20,8 +20,18 @@ class _Conv(nn.Conv2d):
     def __init__(self, channels_in: int, channels_out: int):
         super().__init__(channels_in, channels_out, 3)
 
-    def forward(self, x: torch.Tensor, wrap: bool) -> torch.Tensor:
+    def forward(self, x: torch.Tensor, wrap: bool) -> torch.Tensor:  # type: ignore[override]
         return super().forward(_pad(x, wrap))
+
+
+class _ResidualBlock(nn.Module):
+    def __init__(self, features: int):
+        super().__init__()
+        self.first = _Conv(features, features)
+        self.second = _Conv(features, features)
+
+    def forward(self, x: torch.Tensor, wrap: bool) -> torch.Tensor:
+        return x + self.second(self.first(x, wrap).relu(), wrap)
 
 
 class Encoder(nn.Module):
@@ -38,17 +48,15 @@ class Encoder(nn.Module):
     def __init__(self, features: int = 64, blocks: int = 16):
         super().__init__()
         self.head = _Conv(1, features)
-        self.blocks = nn.ModuleList(
-            nn.ModuleList((_Conv(features, features), _Conv(features, features))) for _ in range(blocks)
-        )
+        self.blocks = nn.ModuleList(_ResidualBlock(features) for _ in range(blocks))
         self.tail = _Conv(features, features)
         # The format in which convolutions are fast, and a pixel's features lie together for `gather_neighbours`.
-        self.to(memory_format=torch.channels_last)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, image: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Maps images (B, 1, H, W) scaled to [-1, 1] to features (B, C, H, W)."""
         head = self.head(image.to(memory_format=torch.channels_last), wrap)
         x = head
-        for first, second in self.blocks:
-            x = x + second(first(x, wrap).relu(), wrap)
+        for block in self.blocks:
+            x = block(x, wrap)
         return head + self.tail(x, wrap)

@@ -40,6 +40,17 @@ class _FeedForward(nn.Sequential):
         )
 
 
+class _Block(nn.Module):
+    def __init__(self, features: int, heads: int, dropout: float):
+        super().__init__()
+        self.attention = _Attention(features, heads, dropout)
+        self.feed_forward = _FeedForward(features, dropout)
+
+    def forward(self, z: torch.Tensor) -> torch.Tensor:
+        z = z + self.attention(z)
+        return z + self.feed_forward(z)
+
+
 class ILN(Model):
     """r̂ = Σ_t w_t r_t with weights w = softmax(g(z'_1..4)) that a network predicts (paper, Eq. 3).
 
@@ -72,14 +83,12 @@ class ILN(Model):
         self.prior, self.area_floor, self.norm_range = prior, area_floor, norm_range
         self.encoder = Encoder(features, blocks)
         self.position = nn.Linear(2, features)
-        self.blocks = nn.ModuleList(
-            nn.ModuleList((_Attention(features, heads, dropout), _FeedForward(features, dropout)))
-            for _ in range(depth)
-        )
-        self.head = nn.Sequential(nn.LayerNorm(features), nn.Linear(features, 1))
+        self.blocks = nn.ModuleList(_Block(features, heads, dropout) for _ in range(depth))
+        score = nn.Linear(features, 1)
         if prior != "none":
-            nn.init.zeros_(self.head[1].weight)
-            nn.init.zeros_(self.head[1].bias)
+            nn.init.zeros_(score.weight)
+            nn.init.zeros_(score.bias)
+        self.head = nn.Sequential(nn.LayerNorm(features), score)
 
     def encode(self, image: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Extracts features z (B, C, H, W) from ranges (B, H, W) [m], scaled to [-1, 1]."""
@@ -89,8 +98,7 @@ class ILN(Model):
         """Weighs and blends the 4 neighbours of each query."""
         z, offsets = gather_neighbours(features, queries, wrap)
         z = z + self.position(offsets * _OFFSET_SCALE)
-        for attention, feed_forward in self.blocks:
-            z = z + attention(z)
-            z = z + feed_forward(z)
+        for block in self.blocks:
+            z = block(z)
         scores = self.head(z).squeeze(-1).float()
         return gather_blend(image, queries, scores, self.prior, wrap, area_floor=self.area_floor)

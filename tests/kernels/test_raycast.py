@@ -63,12 +63,16 @@ def test_plane(device):
 
 def test_sphere(device):
     steps = 200
-    theta, phi = torch.meshgrid(torch.linspace(0, math.pi, steps), torch.linspace(0, math.tau, 2 * steps), indexing="ij")
+    theta, phi = torch.meshgrid(
+        torch.linspace(0, math.pi, steps), torch.linspace(0, math.tau, 2 * steps), indexing="ij"
+    )
     vertices = 3 * torch.stack([theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()], -1).view(-1, 3)
     corner = (torch.arange(steps - 1)[:, None] * 2 * steps + torch.arange(2 * steps - 1)).reshape(-1)
     triangles = torch.cat(
-        [torch.stack([corner, corner + 1, corner + 2 * steps], 1),
-         torch.stack([corner + 1, corner + 2 * steps + 1, corner + 2 * steps], 1)]
+        [
+            torch.stack([corner, corner + 1, corner + 2 * steps], 1),
+            torch.stack([corner + 1, corner + 2 * steps + 1, corner + 2 * steps], 1),
+        ]
     )
     hits = Mesh(vertices, triangles, device).cast(torch.zeros(3, device=device), unit_vectors(2000).to(device), 10.0)
     # Chords of the facets lie inside the sphere by at most r (1 - cos(step / 2)).
@@ -105,7 +109,7 @@ def test_matches_brute_force_on_a_triangle_soup(device, poisoned):
     hits = Mesh(vertices, triangles, device).cast(origins.to(device), directions.to(device), 8.0)
     ranges, numbers = brute_force(vertices, triangles, origins, directions, 8.0)
     # Rays within rounding of a triangle's rim or of the maximum range may go either way.
-    differ = (hits.triangle.cpu() != numbers)
+    differ = hits.triangle.cpu() != numbers
     assert differ.sum() <= 3
     torch.testing.assert_close(hits.range.cpu().double()[~differ], ranges[~differ], rtol=1e-4, atol=METRES)
     assert (ranges > 0).float().mean() > 0.1  # enough hits to mean something

@@ -1,0 +1,27 @@
+import pytest
+import torch
+
+from kernels import Mesh
+
+
+def block(x, y, half, height):
+    """A box that stands on the ground."""
+    corners = torch.tensor([[x + sx, y + sy, z] for sx in (-half, half) for sy in (-half, half) for z in (0.0, height)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return corners, torch.tensor([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+
+
+def yard_triangles():
+    """Flat ground of 100 m and some blocks to look at."""
+    parts = [block(0.0, 0.0, 100.0, 0.0), block(12.0, 3.0, 2.0, 4.0), block(-8.0, 15.0, 3.0, 6.0), block(5, -9, 0.2, 3)]
+    vertices, triangles, count = [], [], 0
+    for v, t in parts:
+        vertices.append(v)
+        triangles.append(t + count)
+        count += len(v)
+    return torch.cat(vertices), torch.cat(triangles)
+
+
+@pytest.fixture(scope="session")
+def yard():
+    return Mesh(*yard_triangles())

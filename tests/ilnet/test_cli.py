@@ -1,0 +1,161 @@
+"""The command line as a user meets it."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+METHODS = {"nearest", "bilinear", "bilinear-inverse", "iln", "iln-prior"}
+
+
+def ilnet(*arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", "ilnet", *map(str, arguments)], cwd=cwd, capture_output=True, text=True, timeout=300
+    )
+
+
+def write_scan(path, ranges, elevations=None, azimuths=None):
+    rows, columns = ranges.shape
+    np.savez(
+        path,
+        range=ranges.astype(np.float32),
+        elevation_deg=np.linspace(15, -15, rows) if elevations is None else elevations,
+        column_azimuth_deg=np.linspace(180, -180, columns, endpoint=False) if azimuths is None else azimuths,
+    )
+
+
+@pytest.fixture
+def scan_file(tmp_path):
+    """A room of 8 m by 12 m: walls and a floor, seen by 32 beams."""
+    elevation, azimuth = np.deg2rad(np.linspace(15, -15, 32))[:, None], np.linspace(np.pi, -np.pi, 256, endpoint=False)
+    x, y, z = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+    with np.errstate(divide="ignore"):
+        ranges = np.minimum(np.minimum(4 / abs(x), 6 / abs(y)), np.where(z < 0, -1.5 / z, np.inf))
+    write_scan(tmp_path / "room.npz", ranges)
+    return tmp_path / "room.npz"
+
+
+@pytest.fixture
+def mesh_file(tmp_path):
+    import pyvista
+
+    cube = pyvista.Cube(center=(9, 2, 1), x_length=2, y_length=2, z_length=2)
+    parts = [pyvista.Plane(i_size=100, j_size=100), cube, pyvista.Sphere(radius=1.5, center=(-5, 4, 1))]
+    mesh = pyvista.merge([part.triangulate() for part in parts]).extract_surface(algorithm=None)
+    mesh.save(tmp_path / "yard.ply")
+    return tmp_path / "yard.ply"
+
+
+def test_demo_of_the_town_prints_a_table_and_draws(tmp_path):
+    done = ilnet("demo", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    table = {line.split()[0]: line.split()[1:] for line in done.stdout.splitlines() if line.split()[:1]}
+    assert set(table) >= METHODS
+    mae, iou = ({name: float(table[name][column]) for name in METHODS} for column in (0, 1))
+    assert mae["iln"] < mae["bilinear"]
+    assert mae["iln-prior"] < mae["bilinear"]
+    assert iou["iln-prior"] > iou["bilinear"]
+    pictures = tmp_path / "demo_output"
+    for name in ("range_images.png", "range_images_sector.png", "points.png"):
+        assert (pictures / name).read_bytes()[:4] == b"\x89PNG"
+    assert (pictures / "iln-prior.ply").read_bytes()[:3] == b"ply"
+
+
+def test_demo_of_a_mesh_prints_one_json_object(tmp_path, mesh_file):
+    done = ilnet("demo", "--mesh", mesh_file, "--at", 0, 0, 1.8, "--json", "--out", "here", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert result["input"] == "16x1024"
+    assert result["output"] == "128x2048"
+    assert set(result["methods"]) == METHODS
+    for figures in result["methods"].values():
+        assert set(figures) == {"mae", "iou", "precision", "recall", "f1"}
+        assert figures["mae"] >= 0
+        assert all(0 <= figures[name] <= 1 for name in ("iou", "precision", "recall", "f1"))
+    assert (tmp_path / "here" / "points.png").exists()
+
+
+def test_demo_of_a_scan_is_judged_against_its_own_rows(tmp_path, scan_file):
+    done = ilnet("demo", "--scan", scan_file, "--rows", 8, "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(done.stdout)
+    assert (result["input"], result["output"]) == ("8x256", "32x256")
+    # Walls are planes: inverse range keeps them, nearest does not.
+    assert result["methods"]["bilinear-inverse"]["mae"] < result["methods"]["nearest"]["mae"]
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".stl", ".vtp"])
+def test_demo_reads_other_mesh_formats(tmp_path, mesh_file, suffix):
+    import pyvista
+
+    from ilnet import meshes
+
+    pyvista.read(mesh_file).save(tmp_path / f"yard{suffix}")
+    vertices, triangles = meshes.read(tmp_path / f"yard{suffix}")
+    assert vertices.min(0) == pytest.approx([-50, -50, -0.5], abs=0.01)
+    assert len(triangles) == meshes.read(mesh_file)[1].shape[0]
+
+
+def bad_files(folder):
+    (folder / "text.ply").write_text("hello\n")
+    (folder / "text.npz").write_text("hello\n")
+    rows = np.full((8, 64), 5.0)
+    np.savez(folder / "no_range.npz", elevation_deg=np.arange(8.0), column_azimuth_deg=np.arange(64.0))
+    write_scan(folder / "zeros.npz", rows * 0)
+    write_scan(folder / "one_beam.npz", rows[:1])
+    write_scan(folder / "good.npz", rows)
+    (folder / "points.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\n"
+        "property float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n"
+    )
+
+
+BAD = {
+    "missing mesh": (["demo", "--mesh", "nowhere.ply", "--at", "0", "0", "0"], "nowhere.ply: there is no such file"),
+    "text called ply": (["demo", "--mesh", "text.ply", "--at", "0", "0", "0"], "text.ply: holds no triangle"),
+    "points as mesh": (["demo", "--mesh", "points.ply", "--at", "0", "0", "0"], "points.ply: holds no triangle"),
+    "cut mesh": (["demo", "--mesh", "cut.ply", "--at", "0", "0", "0"], "cut.ply: "),
+    "mesh far away": (["demo", "--mesh", "yard.ply", "--at", "999", "0", "0"], "the mesh spans"),
+    "at NaN": (["demo", "--mesh", "yard.ply", "--at", "nan", "0", "0"], "finite"),
+    "mesh without at": (["demo", "--mesh", "yard.ply"], "go together"),
+    "missing scan": (["demo", "--scan", "nowhere.npz"], "nowhere.npz"),
+    "text called npz": (["demo", "--scan", "text.npz"], "text.npz"),
+    "no range": (["demo", "--scan", "no_range.npz"], "lacks range"),
+    "all zeros": (["demo", "--scan", "zeros.npz"], "holds no return"),
+    "one beam": (["demo", "--scan", "one_beam.npz"], "at least 2 beams"),
+    "no rows": (["demo", "--scan", "good.npz", "--rows", "0"], "rows must be 2 to 8"),
+    "one row": (["demo", "--scan", "good.npz", "--rows", "1"], "rows must be 2 to 8"),
+    "all rows": (["demo", "--scan", "good.npz", "--rows", "8"], "keep fewer"),
+    "points without sensor": (["demo", "--scan", "points.ply"], "--sensor"),
+    "unknown sensor": (["demo", "--scan", "points.ply", "--sensor", "vlp-61"], "unknown sensor 'vlp-61'"),
+    "unwritable folder": (["demo", "--scan", "good.npz", "--rows", "4", "--out", "text.ply"], "text.ply"),
+    "unknown model": (["train", "ilm"], "'ilm'"),
+    "unknown preset": (["train", "iln", "--preset", "huge"], "unknown preset 'huge'"),
+    "no steps": (["train", "iln", "--steps", "0"], "--steps"),
+    "unknown command": (["dmeo"], "dmeo"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_line_and_exit_code_2(case, tmp_path, mesh_file):
+    bad_files(tmp_path)
+    (tmp_path / "cut.ply").write_bytes(mesh_file.read_bytes()[:2000])
+    arguments, message = BAD[case]
+    done = ilnet(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert message in done.stderr
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_help_comes_without_loading_torch(tmp_path):
+    code = (
+        "import sys, ilnet.cli as c; c.cli(['demo', '--help'], standalone_mode=False); sys.exit('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0
+    assert "--mesh" in done.stdout

@@ -1,0 +1,88 @@
+import math
+
+import pytest
+import torch
+
+from ilnet import data
+from ilnet.sensor import preset
+from kernels import Mesh
+
+SENSOR = preset("paper-16x1024")
+
+
+@pytest.fixture(scope="module")
+def streets():
+    """Two flat worlds whose ground lies at different heights, so that a ray tells where it was cast."""
+    corners = torch.tensor([[-500.0, -500, 0], [500, -500, 0], [500, 500, 0], [-500, 500, 0]])
+    triangles = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    waypoints = torch.tensor([[0.0, 0, 0], [10, 0, 0]])
+    lifts = (torch.tensor([0.0, 0, z]) for z in (0, 7))
+    return [data.Street(Mesh(corners + lift, triangles), waypoints + lift, torch.zeros(2)) for lift in lifts]
+
+
+def rays(streets, seed=0):
+    return data.ContinuousRays(streets, SENSOR, crops=6, columns=64, queries=100, seed=seed)
+
+
+def test_a_batch_is_what_the_model_takes(streets):
+    batch = next(iter(rays(streets)))
+    assert batch.image.shape == (6, 16, 64)
+    assert batch.queries.shape == (6, 100, 2)
+    assert batch.ranges.shape == (6, 100)
+    assert batch.image.dtype == batch.queries.dtype == batch.ranges.dtype == torch.float32
+    assert batch.queries[..., 0].min() >= 0
+    assert batch.queries[..., 0].max() <= 15
+    assert batch.queries[..., 1].min() >= 8
+    assert batch.queries[..., 1].max() <= 55
+
+
+def test_ranges_lie_within_the_limits_or_are_filled(streets):
+    batch = next(iter(rays(streets)))
+    for ranges in (batch.image, batch.ranges):
+        seen = ranges != SENSOR.norm_range
+        assert seen.any()
+        assert (~seen).any()  # above the horizon
+        assert ranges[seen].min() >= SENSOR.min_range
+        assert ranges[seen].max() <= SENSOR.max_range
+
+
+def test_queries_are_the_rays_that_were_cast(streets):
+    # Ranges to a plane are smooth in the pixel coordinate: interpolating inverse range nearly hits the truth.
+    from ilnet.models import create
+
+    batch = next(iter(rays(streets)))
+    predicted = create("bilinear-inverse")(batch.image, batch.queries, wrap=False)
+    near = (batch.ranges < 15) & (predicted < 20)
+    assert near.sum() > 40
+    assert (predicted - batch.ranges)[near].abs().max() < 0.05
+
+
+def test_the_seed_decides(streets):
+    first, again, other = (list(zip(range(3), rays(streets, seed), strict=False)) for seed in (1, 1, 2))
+    for (_, a), (_, b) in zip(first, again, strict=True):
+        assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+    assert not torch.equal(first[0][1].ranges, other[0][1].ranges)
+    assert not torch.equal(first[0][1].ranges, first[1][1].ranges)
+
+
+def test_sensors_sway_and_stand_at_their_height(streets):
+    """Straight ahead and down the range tells the height; its spread the pitch and the jitter."""
+    heights = []
+    for _, batch in zip(range(20), rays(streets), strict=False):
+        lowest = batch.image[:, 0].mean(1)
+        heights.append(lowest * math.sin(math.radians(15)))
+    heights = torch.cat(heights)
+    assert heights.mean() == pytest.approx(data.SENSOR_HEIGHT, abs=0.15)
+    assert 0.1 < heights.std() < 0.6
+
+
+def test_held_out_scans_come_from_waypoints_spread_over_the_town():
+    street = data.street("town01", 0)
+    pairs = data.held_out_scans(street, 3, [SENSOR, preset("paper-64x1024")])
+    assert [[s.ranges.shape for s in pair] for pair in pairs] == [[(16, 1024), (64, 1024)]] * 3
+    for scan, dense in pairs:
+        assert (scan.ranges > 0).float().mean() > 0.5
+        # The outermost beams are the same beams.
+        assert torch.equal(scan.ranges[0], dense.ranges[0])
+        assert torch.equal(scan.ranges[15], dense.ranges[63])
+    assert not torch.equal(pairs[0][0].ranges, pairs[1][0].ranges)

@@ -1,0 +1,233 @@
+import re
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from ilnet import models
+from ilnet.models.encoder import Encoder
+from ilnet.scan import Scan
+from ilnet.sensor import Sensor, preset
+from ilnet.simulate import pose, simulate
+from kernels import reference
+
+# float32 ranges below 100 m through a network of a dozen layers.
+METRES = 1e-3
+# A gradient is a sum over hundreds of queries of metres; some of them cancel to nothing but rounding.
+GRADIENT = 1e-3
+
+
+def small(prior="none", **arguments):
+    torch.manual_seed(0)
+    model = models.ILN(prior=prior, features=16, blocks=2, heads=4, **arguments).eval()
+    # The head of a network with a prior starts at 0; anything else tells more in a test.
+    torch.nn.init.normal_(model.head[1].weight, std=0.5)
+    return model
+
+
+def draw(height=6, width=16, count=200, batch=2):
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(batch, height, width, generator=generator) * 60 + 2
+    queries = torch.rand(batch, count, 2, generator=generator) * torch.tensor([height - 1.0, float(width)])
+    return image, queries
+
+
+@pytest.mark.parametrize(("depth", "parameters"), [(0, 1_219_649), (1, 1_244_673), (2, 1_269_697), (4, 1_319_745)])
+def test_iln_has_the_papers_size(depth, parameters):
+    assert sum(p.numel() for p in models.ILN(depth).parameters()) == parameters
+
+
+def plain_iln(model, image, queries, wrap):
+    """The network once more, formulated with torch's own layers and the reference ops."""
+    scaled = image.clamp(max=100) / 50 - 1
+
+    def conv(layer, x):
+        x = F.pad(x, (1, 1, 0, 0), "circular" if wrap else "replicate")
+        return F.conv2d(F.pad(x, (0, 0, 1, 1), "replicate"), layer.weight, layer.bias)
+
+    head = conv(model.encoder.head, scaled.unsqueeze(1))
+    x = head
+    for block in model.encoder.blocks:
+        x = x + conv(block.second, conv(block.first, x).relu())
+    z, offsets = reference.gather_neighbours(head + conv(model.encoder.tail, x), queries, wrap)
+    z = z + model.position(2 * offsets)
+    for block in model.blocks:
+        attention = block.attention
+        q, k, v = attention.qkv(attention.norm(z)).unflatten(-1, (3, attention.heads, -1)).transpose(2, 4).unbind(3)
+        z = z + attention.out(F.scaled_dot_product_attention(q, k, v).transpose(2, 3).flatten(-2))
+        z = z + block.feed_forward(z)
+    return reference.gather_blend(image, queries, model.head(z).squeeze(-1), model.prior, wrap, model.area_floor)[0]
+
+
+@pytest.mark.parametrize("prior", reference.PRIORS)
+@pytest.mark.parametrize("wrap", [True, False])
+@pytest.mark.parametrize("depth", [0, 1, 2])
+def test_iln_matches_a_plain_formulation_with_gradients(prior, wrap, depth):
+    model, (image, queries) = small(prior, depth=depth), draw()
+    results = []
+    for call in (model, lambda *a: plain_iln(model, *a)):
+        model.zero_grad()
+        ranges = call(image, queries, wrap)
+        ranges.sum().backward()
+        results.append((ranges.detach(), [p.grad.clone() for p in model.parameters()]))
+    torch.testing.assert_close(results[0][0], results[1][0], rtol=0, atol=METRES)
+    for ours, plain in zip(results[0][1], results[1][1], strict=True):
+        torch.testing.assert_close(ours, plain, rtol=1e-2, atol=GRADIENT)
+
+
+# 2.5 mm of 100 m, after 34 convolutions in another order.
+NORMALISED = 5e-5
+
+# Their names for our parameters.
+AUTHORS = [
+    (r"encoder\.head\.0\.conv\.", "encoder.head."),
+    (r"encoder\.body\.(\d+)\.body\.0\.conv\.", r"encoder.blocks.\1.first."),
+    (r"encoder\.body\.(\d+)\.body\.2\.conv\.", r"encoder.blocks.\1.second."),
+    (r"encoder\.body\.\d+\.conv\.", "encoder.tail."),
+    (r"attention\.pos_embedding\.", "position."),
+    (r"attention\.transformer\.layers\.(\d+)\.0\.norm\.", r"blocks.\1.attention.norm."),
+    (r"attention\.transformer\.layers\.(\d+)\.0\.fn\.to_qkv\.", r"blocks.\1.attention.qkv."),
+    (r"attention\.transformer\.layers\.(\d+)\.0\.fn\.to_out\.0\.", r"blocks.\1.attention.out."),
+    (r"attention\.transformer\.layers\.(\d+)\.1\.norm\.", r"blocks.\1.feed_forward.0."),
+    (r"attention\.transformer\.layers\.(\d+)\.1\.fn\.net\.0\.", r"blocks.\1.feed_forward.1."),
+    (r"attention\.transformer\.layers\.(\d+)\.1\.fn\.net\.3\.", r"blocks.\1.feed_forward.4."),
+    (r"attention\.mlp_head\.", "head."),
+]
+
+
+def test_iln_gives_what_the_authors_network_gives(shared):
+    theirs = torch.load(shared / "data/authors/iln_1d_random.pth", weights_only=True)["model"]["state_dict"]
+    state = {}
+    for key, value in theirs.items():
+        for pattern, ours in AUTHORS:
+            key = re.sub("^" + pattern, ours, key)
+        state[key] = value
+    model = models.ILN().eval()
+    model.load_state_dict(state)
+    expected = np.load(shared / "data/authors/iln_1d_expected.npz")
+    image = torch.tensor(expected["range_image_m"]).unsqueeze(0)
+    row, column = torch.tensor(expected["pixel"]).unbind(1)
+    queries = preset("paper-16x1024").grid_queries(preset("paper-64x1024"))[row, column].unsqueeze(0)
+    with torch.no_grad():
+        # Their encoder goes round the circle, their neighbours stop at the seam.
+        features = model.encode(image, wrap=True)
+        ranges = model.decode(features, image, queries, wrap=False).squeeze(0)
+        wrapped = model.decode(features, image, queries, wrap=True).squeeze(0)
+    normalised = torch.tensor(expected["output_normalised"])
+    torch.testing.assert_close(ranges / 50 - 1, normalised, rtol=0, atol=NORMALISED)
+    inner = column < 1023
+    torch.testing.assert_close(wrapped[inner] / 50 - 1, normalised[inner], rtol=0, atol=NORMALISED)
+
+
+@pytest.mark.parametrize(("prior", "baseline"), [("bilinear", "bilinear"), ("perspective", "bilinear-inverse")])
+def test_an_untrained_network_with_a_prior_is_that_interpolation(prior, baseline):
+    torch.manual_seed(0)
+    model = models.create("iln", prior=prior, features=16, blocks=1, heads=4, area_floor=0.0).eval()
+    image, queries = draw()
+    torch.testing.assert_close(model(image, queries), models.create(baseline)(image, queries), rtol=0, atol=METRES)
+
+
+def test_rolling_the_scan_rolls_the_answer():
+    model, (image, queries) = small(), draw()
+    rolled = model(image.roll(5, -1), (queries + torch.tensor([0.0, 5.0])) % torch.tensor([100.0, 16.0]))
+    torch.testing.assert_close(rolled, model(image, queries), rtol=0, atol=METRES)
+
+
+def test_the_encoder_pads_round_the_circle_only_when_asked():
+    torch.manual_seed(0)
+    encoder, x = Encoder(8, 1), torch.randn(1, 1, 5, 12)
+    assert torch.allclose(encoder(x.roll(3, -1), True), encoder(x, True).roll(3, -1), atol=1e-5)
+    assert not torch.allclose(encoder(x.roll(3, -1), False), encoder(x, False).roll(3, -1), atol=1e-5)
+
+
+def test_blends_stay_between_the_neighbours():
+    model, (image, queries) = small(), draw()
+    gathered, _ = reference.gather_neighbours(image.unsqueeze(1), queries, True)
+    ranges = model(image, queries)
+    assert (ranges >= gathered.amin((-1, -2)) - METRES).all()
+    assert (ranges <= gathered.amax((-1, -2)) + METRES).all()
+
+
+@pytest.mark.parametrize("name", ["nearest", "bilinear", "bilinear-inverse", "iln"])
+def test_upsample_to_any_sensor(name, yard):
+    torch.manual_seed(0)
+    arguments = {"features": 16, "blocks": 1} if name == "iln" else {}
+    model = models.create(name, **arguments).eval()
+    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    uneven = Sensor(np.deg2rad([-14.9, -3.0, -2.5, 0.0, 11.0]), np.deg2rad([170, 100, 95, -20, -40.5]))
+    for target in (preset("paper-64x1024"), scan.sensor.resize(33, 500), uneven):
+        dense = model.upsample(scan, target)
+        assert dense.sensor == target
+        assert dense.ranges.any()
+        assert ((dense.ranges == 0) | (dense.ranges >= target.min_range)).all()
+        assert dense.ranges.max() <= target.max_range
+
+
+def test_upsample_does_not_depend_on_the_chunk(yard, monkeypatch):
+    from ilnet.models import base
+
+    model = small("bilinear")
+    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    expected = model.ranges(scan, preset("paper-64x1024"))
+    monkeypatch.setitem(base._CHUNK, "cpu", 777)
+    torch.testing.assert_close(model.ranges(scan, preset("paper-64x1024")), expected, rtol=0, atol=METRES)
+
+
+def test_bilinear_upsampling_is_close_to_the_truth_on_the_ground(yard):
+    here = pose((60.0, -60.0, 1.8))
+    scan = simulate(yard, preset("paper-16x1024"), here)
+    truth = simulate(yard, preset("paper-64x1024"), here)
+    for name, metres in (("bilinear", 0.7), ("bilinear-inverse", 0.02)):
+        dense = models.create(name).ranges(scan, truth.sensor)
+        near = (truth.ranges > 0) & (truth.ranges < 15)
+        assert near.sum() > 5000
+        assert (dense - truth.ranges)[near].abs().max() < metres
+
+
+def test_rays_out_of_view_hold_no_return(yard):
+    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    steep = Sensor(np.deg2rad([-60.0, -10.0]), np.deg2rad([0.0, 10.0]))
+    dense = models.create("bilinear").upsample(scan, steep)
+    assert (dense.ranges[0] == 0).all()
+    assert (dense.ranges[1] > 0).all()
+
+
+def test_a_scan_without_returns_gives_none():
+    sensor = preset("paper-16x1024")
+    empty = Scan(torch.zeros(sensor.shape), sensor)
+    for model in (models.create("bilinear-inverse"), small()):
+        assert not model.upsample(empty, sensor.resize(20, 100)).ranges.any()
+
+
+@pytest.mark.parametrize("name", models.NAMES)
+def test_shipped_models_load_and_predict(name, yard):
+    model = models.load(name)
+    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    truth = simulate(yard, preset("paper-64x1024"), pose((0.0, 0.0, 1.8)))
+    ranges = model.ranges(scan, truth.sensor)
+    # An upper bound for the nearest pixel, the worst of them; no return counts as 100 m.
+    assert (ranges - truth.filled()).abs().mean() < 1.5
+
+
+def test_weights_survive_a_round_trip(tmp_path):
+    model = small("perspective")
+    arguments = {"prior": "perspective", "features": 16, "blocks": 2, "heads": 4}
+    models.save(model, tmp_path / "a.safetensors", "iln", arguments, steps=3)
+    image, queries = draw()
+    assert torch.equal(models.load(tmp_path / "a.safetensors")(image, queries), model(image, queries))
+
+
+def test_bad_weights_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="unknown model 'ilm'"):
+        models.load("ilm")
+    with pytest.raises(ValueError, match="unknown model 'ilm'"):
+        models.create("ilm")
+    with pytest.raises(FileNotFoundError, match="no such file of weights"):
+        models.load(tmp_path / "none.safetensors")
+    (tmp_path / "text.safetensors").write_text("hello")
+    with pytest.raises(ValueError, match="not weights"):
+        models.load(tmp_path / "text.safetensors")
+    models.save(small(), tmp_path / "other.safetensors", "iln", {"blocks": 3})
+    with pytest.raises(ValueError, match="not weights"):
+        models.load(tmp_path / "other.safetensors")

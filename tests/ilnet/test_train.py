@@ -1,0 +1,81 @@
+import csv
+
+import pytest
+import torch
+
+from ilnet import data, models, train
+from ilnet.sensor import preset
+from ilnet.simulate import pose, simulate
+
+
+@pytest.fixture
+def quick(monkeypatch, yard):
+    """Training in the yard, with a network and batches of a size for tests."""
+    street = data.Street(yard, torch.tensor([[3.0, 0, 0], [-3, 2, 0], [0, -4, 0]]), torch.zeros(3))
+    monkeypatch.setattr(train.data, "street", lambda *args: street)
+    monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
+    size = train.Preset(blocks=1, steps=4, rate=1e-3, crops=2, columns=32, queries=64)
+    monkeypatch.setitem(train.PRESETS, "tiny", size)
+    # CUDA or not, the figures of these tests do not depend on it.
+    return lambda out, **options: train.train("iln-prior", "tiny", out, features=16, heads=4, **options)
+
+
+def test_writes_weights_that_load_and_figures(tmp_path, quick):
+    figures = quick(tmp_path)
+    assert set(figures) == {f"val/{name}" for name in ("mae", "iou", "precision", "recall", "f1")}
+    model = models.load(tmp_path / "iln-prior.safetensors")
+    assert model.prior == models.create("iln-prior").prior
+    with open(tmp_path / "iln-prior" / "metrics.csv") as log:
+        assert any(row["val/iou"] for row in csv.DictReader(log))
+
+
+def test_the_same_seed_gives_the_same_weights(tmp_path, quick):
+    weights = []
+    for number, seed in enumerate((0, 0, 1)):
+        quick(tmp_path / str(number), seed=seed)
+        weights.append(models.load(tmp_path / str(number) / "iln-prior.safetensors").state_dict())
+    assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
+    assert not torch.equal(weights[0]["position.weight"], weights[2]["position.weight"])
+
+
+def test_training_lowers_the_loss(yard):
+    torch.manual_seed(0)
+    model = models.create("iln", features=16, blocks=1, heads=4, dropout=0.0)
+    street = data.Street(yard, torch.tensor([[3.0, 0, 0], [-3, 2, 0]]), torch.zeros(2))
+    batch = next(iter(data.ContinuousRays([street], preset("paper-16x1024"), 4, 64, 256, seed=0)))
+    training = train.Training(model, [], rate=1e-3)
+    training.log = lambda *args, **kwargs: None
+    optimizer = torch.optim.Adam(model.parameters(), 3e-3)
+    losses = []
+    for _ in range(30):
+        optimizer.zero_grad()
+        loss = training.training_step(batch, 0)
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.8 * losses[0]
+
+
+def test_the_loss_is_in_units_of_the_normalised_range(yard):
+    model = models.create("iln", features=16, blocks=1, heads=4).eval()
+    training = train.Training(model, [], rate=1e-3)
+    training.log = lambda *args, **kwargs: None
+    batch = data.Batch(torch.full((1, 4, 8), 20.0), torch.rand(1, 5, 2) * 3, torch.full((1, 5), 70.0))
+    assert training.training_step(batch, 0).item() == pytest.approx(50 * 2 / 100)
+
+
+def test_unknown_names_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="unknown preset 'huge'; known are tiny"):
+        train.train("iln", "huge", tmp_path)
+    with pytest.raises(ValueError, match="'bilinear' cannot be trained"):
+        train.train("bilinear", "tiny", tmp_path)
+
+
+def test_the_head_of_a_network_with_a_prior_gets_a_gradient(yard):
+    """Zero scores at the start must not be a dead end."""
+    model = models.create("iln-prior", features=16, blocks=1, heads=4)
+    here = pose((0.0, 0.0, 1.8))
+    image = simulate(yard, preset("paper-16x1024"), here).filled().unsqueeze(0)
+    queries = torch.rand(1, 500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([15.0, 1024.0])
+    model(image, queries).sum().backward()
+    assert model.head[1].weight.grad.abs().max() > 0
