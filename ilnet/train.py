@@ -50,7 +50,7 @@ class Preset:
         return {"blocks": self.blocks, "dropout": self.dropout}
 
 
-PRESETS = {"tiny": Preset(blocks=4, steps=200, rate=1e-3)}
+PRESETS = {"tiny": Preset(blocks=4, steps=150, rate=1e-3)}
 
 
 class Training(lightning.LightningModule):
