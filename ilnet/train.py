@@ -44,10 +44,9 @@ class Preset:
     dropout: float = 0.0
     """In the attention blocks."""
 
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """What differs from the model's own defaults."""
-        return {"blocks": self.blocks, "dropout": self.dropout}
+    def arguments(self, name: str) -> dict[str, Any]:
+        """What differs from the own defaults of the model called `name`."""
+        return {"blocks": self.blocks} | ({} if name == "liif" else {"dropout": self.dropout})
 
 
 PRESETS = {"tiny": Preset(blocks=4, steps=150, rate=1e-3)}
@@ -62,7 +61,7 @@ class Training(lightning.LightningModule):
         rate: Highest learning rate.
     """
 
-    def __init__(self, model: models.ILN, held_out: list[list[Scan]], rate: float):
+    def __init__(self, model: models.ILN | models.LIIF, held_out: list[list[Scan]], rate: float):
         super().__init__()
         self.model, self.held_out, self.rate = model, held_out, rate
 
@@ -113,9 +112,9 @@ def train(
     size = PRESETS[preset_name]
     steps = size.steps if steps is None else steps
     lightning.seed_everything(seed, verbose=False)
-    arguments = {**size.arguments, **arguments}
+    arguments = {**size.arguments(name), **arguments}
     model = models.create(name, **arguments)
-    assert isinstance(model, models.ILN)
+    assert isinstance(model, models.ILN | models.LIIF)
     rays = data.ContinuousRays(
         [data.street(TOWN, s) for s in TRAIN_SEEDS], preset(INPUT), size.crops, size.columns, size.queries, seed
     )

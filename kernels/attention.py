@@ -50,7 +50,7 @@ def _attend_neighbours_kernel(
     first: int,
     # in
     qkv: wp.array4d[Any],
-    scale: Any,
+    scale: wp.Float,
     # out
     attended_out: wp.array4d[Any],
 ):
@@ -72,7 +72,7 @@ def _attend_neighbours_backward_kernel(
     # in
     qkv: wp.array4d[Any],
     adj_attended: wp.array4d[Any],
-    scale: Any,
+    scale: wp.Float,
     # out
     adj_qkv_out: wp.array4d[Any],
 ):

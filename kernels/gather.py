@@ -17,12 +17,12 @@ def _gather_neighbours_kernel(
     first: int,
     # in
     features: wp.array4d[Any],
-    queries: wp.array3d[Any],
+    queries: wp.array3d[wp.Float],
     span: int,
     wrap: int,
     # out
     gathered_out: wp.array4d[Any],
-    offsets_out: wp.array4d[Any],
+    offsets_out: wp.array4d[wp.Float],
 ):
     channels = features.shape[3]
     spans = (channels + span - 1) // span
@@ -43,7 +43,7 @@ def _gather_neighbours_kernel(
         offsets_out[b, q, t, 1] = dc
 
 
-_gather = overload(_gather_neighbours_kernel)
+_gather = overload(_gather_neighbours_kernel, half=True)
 
 
 @torch.library.custom_op("kernels::gather_neighbours", mutates_args=())
@@ -51,7 +51,7 @@ def _gather_neighbours(features: torch.Tensor, queries: torch.Tensor, wrap: bool
     batch, _, _, channels = features.shape
     count = queries.shape[1]
     gathered = features.new_empty(batch, count, 4, channels)
-    offsets = features.new_empty(batch, count, 4, 2)
+    offsets = queries.new_empty(batch, count, 4, 2)
     span = channel_span(channels, features.device)
     threads = batch * count * 4 * -(-channels // span)
     launch(_gather[features.dtype], threads, [features, queries, span, int(wrap)], [gathered, offsets])
@@ -62,7 +62,7 @@ def _gather_neighbours(features: torch.Tensor, queries: torch.Tensor, wrap: bool
 def _(features: torch.Tensor, queries: torch.Tensor, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
     batch, _, _, channels = features.shape
     count = queries.shape[1]
-    return features.new_empty(batch, count, 4, channels), features.new_empty(batch, count, 4, 2)
+    return features.new_empty(batch, count, 4, channels), queries.new_empty(batch, count, 4, 2)
 
 
 def _setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
@@ -75,7 +75,8 @@ def _backward(ctx: Any, gradient: torch.Tensor, _: torch.Tensor) -> tuple[torch.
     (queries,) = ctx.saved_tensors
     if not ctx.needs_input_grad[0]:
         return None, None, None
-    return adjoint_of_gather(gradient, queries, ctx.height, ctx.width, ctx.wrap), None, None
+    pixels = adjoint_of_gather(gradient.to(queries.dtype), queries, ctx.height, ctx.width, ctx.wrap)
+    return pixels.to(gradient.dtype), None, None
 
 
 _gather_neighbours.register_autograd(_backward, setup_context=_setup_context)
@@ -89,7 +90,8 @@ def gather_neighbours(
     Differentiable in `features`; `queries` and the offsets carry no gradient. The backward pass is deterministic.
 
     Args:
-        features: (..., C, H, W) float32 or float64. Memory format `channels_last` is read in place.
+        features: (..., C, H, W) of any floating-point dtype. Memory format `channels_last` is read in place. The
+            gradients of half precision are summed in float32.
         queries: (..., Q, 2) pixel coordinates (row, column); integers are pixel centres. Leading dimensions broadcast
             against those of `features`.
         wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
@@ -97,7 +99,7 @@ def gather_neighbours(
 
     Returns:
         gathered: (..., Q, 4, C), neighbours in the order (row-, col-), (row-, col+), (row+, col-), (row+, col+).
-        offsets: (..., Q, 4, 2), query minus neighbour in pixels.
+        offsets: (..., Q, 4, 2), query minus neighbour in pixels; float64 where the features are, else float32.
 
     Raises:
         TypeError: If `features` or `queries` is not a floating-point tensor of a supported dtype.
@@ -108,11 +110,11 @@ def gather_neighbours(
     check_backend(backend)
     if not isinstance(features, torch.Tensor) or features.dtype not in _gather:
         kind = getattr(features, "dtype", type(features).__name__)
-        raise TypeError(f"features is {kind}; it should be a float32 or float64 tensor (..., C, H, W)")
+        raise TypeError(f"features is {kind}; it should be a floating-point tensor (..., C, H, W)")
     if features.ndim < 3 or 0 in features.shape[-3:]:
         raise ValueError(f"features has shape {tuple(features.shape)}; it should be (..., C, H, W), none of them 0")
     check_queries(queries, features, "features")
-    queries = queries.detach().to(features.dtype)
+    queries = queries.detach().to(torch.promote_types(features.dtype, torch.float32))
     batch, (features, queries) = broadcast_batch(features=(features, 3), queries=(queries, 2))
     if backend == "torch":
         gathered, offsets = reference.gather_neighbours(features, queries, wrap)

@@ -49,7 +49,7 @@ def _gather_blend_kernel(
     image: wp.array3d[Any],
     queries: wp.array3d[Any],
     scores: wp.array3d[Any],
-    area_floor: Any,
+    area_floor: wp.Float,
     prior: int,
     wrap: int,
     # out

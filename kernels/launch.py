@@ -81,19 +81,20 @@ def overload(kernel: wp.Kernel, half: bool = False) -> dict[torch.dtype, wp.Kern
     All are made when the module is imported: a later overload would change the module's hash and compile it again.
 
     Args:
-        kernel: A kernel whose arrays of numbers are annotated `Any`, and whose scalars of that kind are too; a scalar
-            is float32 beside arrays of half precision, so that `type(scalar)` is what to compute with.
+        kernel: A kernel with two generic types. `Any` is what its tensors store; `wp.Float` is what it computes with,
+            in other tensors or in scalars: the same, but float32 beside half precision.
         half: Whether bfloat16 and float16 are served besides float32 and float64.
 
     Returns:
-        The concrete kernel for each torch dtype.
+        The concrete kernel for each torch dtype of the stored tensors.
     """
     dtypes = list(_DTYPES) if half else [torch.float32, torch.float64]
 
     def concrete(annotation: Any, stored: type, computed: type) -> Any:
-        if getattr(annotation, "dtype", None) is Any:
-            return wp.array(dtype=stored, ndim=annotation.ndim)
-        return computed if annotation is Any else annotation
+        known = {Any: stored, wp.Float: computed}
+        if (dtype := getattr(annotation, "dtype", None)) in known:
+            return wp.array(dtype=known[dtype], ndim=annotation.ndim)
+        return known.get(annotation, annotation)
 
     return {
         dtype: wp.overload(kernel, [concrete(arg.type, *_DTYPES[dtype]) for arg in kernel.adj.args]) for dtype in dtypes

@@ -10,6 +10,7 @@ import torch
 __all__ = [
     "PRIORS",
     "RANGE_FLOOR",
+    "area_blend",
     "areas",
     "gather_blend",
     "gather_neighbours",
@@ -60,6 +61,11 @@ def areas(queries: torch.Tensor) -> torch.Tensor:
     fraction = queries - queries.floor()
     fr, fc = fraction.unbind(-1)
     return torch.stack([(1 - fr) * (1 - fc), (1 - fr) * fc, fr * (1 - fc), fr * fc], -1)
+
+
+def area_blend(values: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
+    """`kernels.area_blend` on values (N, 4) and queries (N, 2)."""
+    return (values * areas(queries)).sum(-1).to(values.dtype)
 
 
 def gather_neighbours(features: torch.Tensor, queries: torch.Tensor, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:

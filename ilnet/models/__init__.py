@@ -10,19 +10,21 @@ from safetensors.torch import load_file, save_file
 from ilnet.models.base import Model, returns
 from ilnet.models.bilinear import Bilinear, Nearest
 from ilnet.models.iln import ILN
+from ilnet.models.liif import LIIF
 
-__all__ = ["ILN", "NAMES", "TRAINABLE", "Bilinear", "Model", "Nearest", "create", "load", "returns", "save"]
+__all__ = ["ILN", "LIIF", "NAMES", "TRAINABLE", "Bilinear", "Model", "Nearest", "create", "load", "returns", "save"]
 
 # What `iln-prior` adds to the paper's network was chosen on scans held out of the training towns.
 _MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
     "nearest": (Nearest, {}),
     "bilinear": (Bilinear, {}),
     "bilinear-inverse": (Bilinear, {"inverse": True}),
+    "liif": (LIIF, {}),
     "iln": (ILN, {}),
     "iln-prior": (ILN, {"prior": "perspective"}),
 }
 NAMES = tuple(_MODELS)
-TRAINABLE = tuple(name for name, (kind, _) in _MODELS.items() if kind is ILN)
+TRAINABLE = tuple(name for name, (kind, _) in _MODELS.items() if kind in (ILN, LIIF))
 
 _SHIPPED = Path(__file__).parents[1] / "weights"
 
@@ -72,6 +74,8 @@ def load(name: str | Path) -> Model:
     if name in NAMES and name not in TRAINABLE:
         return create(str(name)).eval()
     path = _SHIPPED / f"{name}.safetensors" if name in NAMES else Path(name)
+    if name in NAMES and not path.is_file():
+        raise FileNotFoundError(f"no weights ship for {name}; train them: python -m ilnet train {name}")
     if not path.is_file():
         if path.suffix != ".safetensors":
             raise ValueError(f"unknown model {str(name)!r}; known are {', '.join(NAMES)}, or a .safetensors file")

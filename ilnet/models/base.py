@@ -6,7 +6,10 @@ from torch import nn
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 
-__all__ = ["Model", "returns"]
+__all__ = ["OFFSET_SCALE", "Model", "normalised", "returns"]
+
+# The authors measure offsets in half pixels; their checkpoints are worth the factor.
+OFFSET_SCALE = 2.0
 
 # Queries decoded at a time: the activations of so many fit the cache of a CPU core.
 _CHUNK = {"cpu": 4096, "cuda": 65536}
@@ -80,6 +83,11 @@ class Model(nn.Module):
             the maximum or below the minimum range of `sensor`, hold no return.
         """
         return returns(self.ranges(scan, sensor), scan.sensor, sensor)
+
+
+def normalised(image: torch.Tensor, norm_range: float) -> torch.Tensor:
+    """Scales ranges (B, H, W) [m] to the encoder's input (B, 1, H, W) in [-1, 1]; farther than `norm_range` is 1."""
+    return (image.clamp(max=norm_range) * (2 / norm_range) - 1).unsqueeze(1)
 
 
 def returns(ranges: torch.Tensor, source: Sensor, sensor: Sensor) -> Scan:

@@ -3,14 +3,11 @@
 import torch
 from torch import nn
 
-from ilnet.models.base import Model
+from ilnet.models.base import OFFSET_SCALE, Model, normalised
 from ilnet.models.encoder import Encoder
 from kernels import gather_blend, gather_neighbours, neighbour_attention
 
 __all__ = ["ILN"]
-
-# The authors measure offsets in half pixels; their checkpoints are worth the factor.
-_OFFSET_SCALE = 2.0
 
 
 class _Attention(nn.Module):
@@ -92,12 +89,12 @@ class ILN(Model):
 
     def encode(self, image: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Extracts features z (B, C, H, W) from ranges (B, H, W) [m], scaled to [-1, 1]."""
-        return self.encoder((image.clamp(max=self.norm_range) * (2 / self.norm_range) - 1).unsqueeze(1), wrap).float()
+        return self.encoder(normalised(image, self.norm_range), wrap)
 
     def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Weighs and blends the 4 neighbours of each query."""
         z, offsets = gather_neighbours(features, queries, wrap)
-        z = z + self.position(offsets * _OFFSET_SCALE)
+        z = z + self.position(offsets * OFFSET_SCALE)
         for block in self.blocks:
             z = block(z)
         scores = self.head(z).squeeze(-1).float()

@@ -35,6 +35,20 @@ def test_matches_the_reference_with_gradients(height, width, wrap, channels, dev
     torch.testing.assert_close(gradient, gradient_ref, rtol=SUM, atol=SUM)
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_half_precision_is_copied_and_its_gradient_summed_in_float32(dtype, device, poisoned):
+    features, queries = draw(6, 8, device, count=5000)
+    half = features.to(dtype).requires_grad_()
+    gathered, offsets = gather_neighbours(half, queries)
+    expected, expected_offsets = gather_neighbours(half.float(), queries)
+    assert gathered.dtype == dtype
+    assert torch.equal(gathered.float(), expected)
+    assert torch.equal(offsets, expected_offsets)
+    (gradient,) = torch.autograd.grad(gathered.sum(), half)
+    ones = torch.autograd.grad(gather_neighbours(features.requires_grad_(), queries)[0].sum(), features)[0]
+    assert torch.equal(gradient, ones.to(dtype))
+
+
 def test_order_of_the_neighbours_and_sign_of_the_offsets(device):
     features = torch.arange(12.0, device=device).view(1, 3, 4)
     gathered, offsets = gather_neighbours(features, torch.tensor([[1.25, 2.5], [0.0, 3.75]], device=device))

@@ -1,0 +1,127 @@
+"""area_blend: values at the 4 neighbours, weighted by bilinear areas (paper, Eq. 2).
+
+    r̂ = Σ_t (S_t / S) v_t,    ∂r̂/∂v_t = S_t / S
+
+S_t is the area of the rectangle between the query and the neighbour diagonally opposite to t. With the neighbours' own
+ranges as values this is bilinear interpolation; LIIF lets a network predict the values.
+"""
+
+from typing import Any
+
+import torch
+import warp as wp
+
+from kernels import reference
+from kernels.launch import check_backend, launch, overload
+from kernels.neighbours import area, broadcast_batch, check_queries
+
+__all__ = ["area_blend"]
+
+
+@wp.kernel(enable_backward=False)
+def _area_blend_kernel(
+    first: int,
+    # in
+    values: wp.array2d[Any],
+    queries: wp.array2d[wp.Float],
+    # out
+    blended_out: wp.array[Any],
+):
+    q = first + wp.tid()
+    row = queries[q, 0]
+    column = queries[q, 1]
+    blended = type(row)(0.0)
+    for t in range(4):
+        blended = blended + area(row, column, t) * type(row)(values[q, t])
+    blended_out[q] = values.dtype(blended)
+
+
+@wp.kernel(enable_backward=False)
+def _area_blend_backward_kernel(
+    first: int,
+    # in
+    adj_blended: wp.array[Any],
+    queries: wp.array2d[wp.Float],
+    # out
+    adj_values_out: wp.array2d[Any],
+):
+    q = first + wp.tid()
+    row = queries[q, 0]
+    column = queries[q, 1]
+    for t in range(4):
+        adj_values_out[q, t] = adj_values_out.dtype(area(row, column, t) * type(row)(adj_blended[q]))
+
+
+_blend = overload(_area_blend_kernel, half=True)
+_blend_backward = overload(_area_blend_backward_kernel, half=True)
+
+
+@torch.library.custom_op("kernels::area_blend", mutates_args=())
+def _area_blend(values: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
+    blended = values.new_empty(len(values))
+    launch(_blend[values.dtype], len(values), [values, queries], [blended])
+    return blended
+
+
+@_area_blend.register_fake
+def _(values: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
+    return values.new_empty(values.shape[0])
+
+
+@torch.library.custom_op("kernels::area_blend_backward", mutates_args=())
+def _area_blend_backward(adj_blended: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
+    adj_values = adj_blended.new_empty(len(queries), 4)
+    launch(_blend_backward[adj_blended.dtype], len(queries), [adj_blended, queries], [adj_values])
+    return adj_values
+
+
+@_area_blend_backward.register_fake
+def _(adj_blended: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
+    return adj_blended.new_empty(queries.shape[0], 4)
+
+
+def _setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
+    ctx.save_for_backward(inputs[1])
+
+
+def _backward(ctx: Any, adj_blended: torch.Tensor) -> tuple[torch.Tensor, None]:
+    (queries,) = ctx.saved_tensors
+    return _area_blend_backward(adj_blended, queries), None
+
+
+_area_blend.register_autograd(_backward, setup_context=_setup_context)
+
+
+def area_blend(values: torch.Tensor, queries: torch.Tensor, backend: str = "warp") -> torch.Tensor:
+    """Blends one value per neighbour with the bilinear areas of a query.
+
+    Differentiable in `values`.
+
+    Args:
+        values: (..., Q, 4) of any floating-point dtype and unit, one per neighbour in the order (row-, col-),
+            (row-, col+), (row+, col-), (row+, col+). Half precision is summed in float32.
+        queries: (..., Q, 2) pixel coordinates (row, column). Leading dimensions broadcast against those of `values`.
+        backend: "warp", or "torch" for the plain twin in `kernels.reference`.
+
+    Returns:
+        (..., Q), in the unit of the values.
+
+    Raises:
+        TypeError: If an argument is not a floating-point tensor of a supported dtype.
+        ValueError: If a shape, device or backend does not fit.
+
+    Source: paper Eq. 2 (the weight function S_t / S).
+    """
+    check_backend(backend)
+    if not isinstance(values, torch.Tensor) or values.dtype not in _blend:
+        kind = getattr(values, "dtype", type(values).__name__)
+        raise TypeError(f"values is {kind}; it should be a floating-point tensor (..., Q, 4)")
+    check_queries(queries, values, "values")
+    if values.ndim < 2 or values.shape[-2:] != (queries.shape[-2], 4):
+        raise ValueError(f"values has shape {tuple(values.shape)}; it should be (..., {queries.shape[-2]}, 4)")
+    queries = queries.detach().to(torch.promote_types(values.dtype, torch.float32))
+    count = queries.shape[-2]
+    batch, (values, queries) = broadcast_batch(values=(values, 2), queries=(queries, 2))
+    values, queries = values.flatten(0, 1).contiguous(), queries.flatten(0, 1).contiguous()
+    blended = reference.area_blend(values, queries) if backend == "torch" else _area_blend(values, queries)
+    return blended.view(*batch, count)
