@@ -23,18 +23,9 @@ from kernels.launch import check_backend, launch, overload
 __all__ = ["neighbour_attention"]
 
 
-_Q, _K, _V = wp.constant(0), wp.constant(1), wp.constant(2)
-
-
 @wp.func
-def _probabilities(qkv: wp.array4d[Any], n: int, h: int, scale: Any):
-    """P (4, 4) of head h of query n."""
-    p = wp.matrix(shape=(4, 4), dtype=type(scale))
-    for d in range(qkv.shape[3]):
-        for i in range(4):
-            q = type(scale)(qkv[n, 3 * i + _Q, h, d]) * scale
-            for j in range(4):
-                p[i, j] = p[i, j] + q * type(scale)(qkv[n, 3 * j + _K, h, d])
+def _softmax_rows(logits: Any):
+    p = logits
     for i in range(4):
         largest = wp.max(wp.max(p[i, 0], p[i, 1]), wp.max(p[i, 2], p[i, 3]))
         for j in range(4):
@@ -43,6 +34,38 @@ def _probabilities(qkv: wp.array4d[Any], n: int, h: int, scale: Any):
         for j in range(4):
             p[i, j] = p[i, j] / total
     return p
+
+
+@wp.func
+def _adj_logits(p: Any, adj_p: Any):
+    """S from P and G vᵀ."""
+    s = adj_p
+    for i in range(4):
+        mean = p[i, 0] * s[i, 0] + p[i, 1] * s[i, 1] + p[i, 2] * s[i, 2] + p[i, 3] * s[i, 3]
+        for j in range(4):
+            s[i, j] = p[i, j] * (s[i, j] - mean)
+    return s
+
+
+@wp.func
+def _four(array: wp.array4d[Any], n: int, step: int, start: int, h: int, d: int, scale: Any):
+    """Entries start, start + step, ... of array[n, :, h, d]: one for each neighbour.
+
+    In qkv the neighbours' queries, keys and values stand in turn: 3 t, 3 t + 1, 3 t + 2.
+    """
+    values = wp.vector(dtype=type(scale), length=4)
+    for t in range(4):
+        values[t] = type(scale)(array[n, start + step * t, h, d])
+    return values
+
+
+@wp.func
+def _attention_map(qkv: wp.array4d[Any], n: int, h: int, scale: Any):
+    """P (4, 4) of head h of query n."""
+    logits = wp.matrix(shape=(4, 4), dtype=type(scale))
+    for d in range(qkv.shape[3]):
+        logits = logits + wp.outer(_four(qkv, n, 3, 0, h, d, scale) * scale, _four(qkv, n, 3, 1, h, d, scale))
+    return _softmax_rows(logits)
 
 
 @wp.kernel(enable_backward=False)
@@ -57,13 +80,11 @@ def _attend_neighbours_kernel(
     thread = first + wp.tid()
     n = thread // qkv.shape[2]
     h = thread % qkv.shape[2]
-    p = _probabilities(qkv, n, h, scale)
+    p = _attention_map(qkv, n, h, scale)
     for d in range(qkv.shape[3]):
-        for i in range(4):
-            blended = type(scale)(0.0)
-            for j in range(4):
-                blended = blended + p[i, j] * type(scale)(qkv[n, 3 * j + _V, h, d])
-            attended_out[n, i, h, d] = qkv.dtype(blended)
+        attended = p * _four(qkv, n, 3, 2, h, d, scale)
+        for t in range(4):
+            attended_out[n, t, h, d] = qkv.dtype(attended[t])
 
 
 @wp.kernel(enable_backward=False)
@@ -79,29 +100,19 @@ def _attend_neighbours_backward_kernel(
     thread = first + wp.tid()
     n = thread // qkv.shape[2]
     h = thread % qkv.shape[2]
-    p = _probabilities(qkv, n, h, scale)
-    s = wp.matrix(shape=(4, 4), dtype=type(scale))
+    p = _attention_map(qkv, n, h, scale)
+    adj_p = wp.matrix(shape=(4, 4), dtype=type(scale))
     for d in range(qkv.shape[3]):
-        for i in range(4):
-            g = type(scale)(adj_attended[n, i, h, d])
-            for j in range(4):
-                s[i, j] = s[i, j] + g * type(scale)(qkv[n, 3 * j + _V, h, d])
-    for i in range(4):
-        mean = p[i, 0] * s[i, 0] + p[i, 1] * s[i, 1] + p[i, 2] * s[i, 2] + p[i, 3] * s[i, 3]
-        for j in range(4):
-            s[i, j] = p[i, j] * (s[i, j] - mean)
+        adj_p = adj_p + wp.outer(_four(adj_attended, n, 1, 0, h, d, scale), _four(qkv, n, 3, 2, h, d, scale))
+    s = _adj_logits(p, adj_p) * scale
     for d in range(qkv.shape[3]):
-        for i in range(4):
-            adj_q = type(scale)(0.0)
-            adj_k = type(scale)(0.0)
-            adj_v = type(scale)(0.0)
-            for j in range(4):
-                adj_q = adj_q + s[i, j] * type(scale)(qkv[n, 3 * j + _K, h, d])
-                adj_k = adj_k + s[j, i] * type(scale)(qkv[n, 3 * j + _Q, h, d])
-                adj_v = adj_v + p[j, i] * type(scale)(adj_attended[n, j, h, d])
-            adj_qkv_out[n, 3 * i + _Q, h, d] = qkv.dtype(adj_q * scale)
-            adj_qkv_out[n, 3 * i + _K, h, d] = qkv.dtype(adj_k * scale)
-            adj_qkv_out[n, 3 * i + _V, h, d] = qkv.dtype(adj_v)
+        adj_q = s * _four(qkv, n, 3, 1, h, d, scale)
+        adj_k = wp.transpose(s) * _four(qkv, n, 3, 0, h, d, scale)
+        adj_v = wp.transpose(p) * _four(adj_attended, n, 1, 0, h, d, scale)
+        for t in range(4):
+            adj_qkv_out[n, 3 * t, h, d] = qkv.dtype(adj_q[t])
+            adj_qkv_out[n, 3 * t + 1, h, d] = qkv.dtype(adj_k[t])
+            adj_qkv_out[n, 3 * t + 2, h, d] = qkv.dtype(adj_v[t])
 
 
 _attend = overload(_attend_neighbours_kernel, half=True)
