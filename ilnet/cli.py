@@ -12,16 +12,19 @@ __all__ = ["main"]
 # The commands import what they need themselves, so that `--help` and a typing error answer at once.
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
-def cli() -> None:
+@click.group(context_settings={"help_option_names": ["-h", "--help"]}, invoke_without_command=True)
+@click.pass_context
+def cli(context: click.Context) -> None:
     """Implicit LiDAR Network: dense range images from sparse ones."""
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
 
 
 @cli.command()
 @click.option("--mesh", type=Path, metavar="FILE", help="Scan this mesh (metres, z up) instead of the town.")
 @click.option("--at", type=(float, float, float), metavar="X Y Z", help="Position of the sensor in the mesh [m].")
 @click.option("--scan", type=Path, metavar="FILE", help="Decimate this scan, and judge against all of its rows.")
-@click.option("--rows", type=int, default=16, show_default=True, help="Beams of the scan to keep.")
+@click.option("--rows", type=int, metavar="N", help="Beams of the scan to keep; 16 unless told.")
 @click.option("--sensor", metavar="NAME", help="Preset with the scan's angles, where the file does not name them.")
 @click.option("--out", type=Path, default=Path("demo_output"), show_default=True, help="Folder for the pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the table.")
@@ -29,7 +32,7 @@ def demo(
     mesh: Path | None,
     at: tuple[float, float, float] | None,
     scan: Path | None,
-    rows: int,
+    rows: int | None,
     sensor: str | None,
     out: Path,
     as_json: bool,
@@ -39,12 +42,14 @@ def demo(
         raise click.UsageError("--mesh and --scan exclude each other")
     if bool(mesh) != (at is not None):
         raise click.UsageError("--mesh FILE and --at X Y Z go together")
+    if not scan and (rows is not None or sensor is not None):
+        raise click.UsageError("--rows and --sensor go with --scan FILE")
     from ilnet import demo as demonstration
 
     if mesh and at:
         pair, source = demonstration.from_mesh(mesh, at), mesh.name
     elif scan:
-        pair, source = demonstration.from_scan(scan, rows, sensor), scan.name
+        pair, source = demonstration.from_scan(scan, 16 if rows is None else rows, sensor), scan.name
     else:
         pair, source = demonstration.from_town(), demonstration.TOWN
     result = demonstration.demo(*pair, out, source)
@@ -60,7 +65,9 @@ def demo(
 @click.argument("model")
 @click.option("--preset", default="tiny", show_default=True, help="Size of the network and of its training.")
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps, instead of the preset's.")
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the initial weights and the rays.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the initial weights and the rays."
+)
 @click.option("--out", type=Path, default=Path("runs"), show_default=True, help="Folder for weights, figures, logs.")
 def train(model: str, preset: str, steps: int | None, seed: int, out: Path) -> None:
     """Train MODEL on rays cast at continuous directions; goes on where an interrupted run in --out stopped."""
@@ -83,7 +90,7 @@ def main() -> None:
         sys.exit(cli.main(prog_name="python -m ilnet", standalone_mode=False))
     except click.ClickException as error:
         message = error.format_message()
-    except click.Abort:
+    except (click.Abort, KeyboardInterrupt):
         sys.exit(130)
     except (ValueError, OSError) as error:
         message = str(error)

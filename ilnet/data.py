@@ -1,10 +1,12 @@
 """Training data: rays at continuous directions, cast while the network trains (paper, Sec. III-A: intractable)."""
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch.utils.data import IterableDataset
 
@@ -79,17 +81,20 @@ class ContinuousRays(IterableDataset):
         crops: Crops B in a batch.
         columns: Columns W of a crop.
         queries: Rays Q per crop.
-        seed: Of the random numbers; the same seed gives the same batches.
+        seed: Of the random numbers; seed and number of a batch decide what it holds.
+        start: Number of the first batch, for a training that goes on.
     """
 
-    def __init__(self, streets: list[Street], sensor: Sensor, crops: int, columns: int, queries: int, seed: int):
-        self.streets, self.crops, self.queries, self.seed = streets, crops, queries, seed
+    def __init__(
+        self, streets: list[Street], sensor: Sensor, crops: int, columns: int, queries: int, seed: int, start: int = 0
+    ):
+        self.streets, self.crops, self.queries, self.seed, self.start = streets, crops, queries, seed, start
         self.sensor = replace(sensor, azimuths=sensor.azimuths[:columns], name=f"{sensor.name} crop")
 
     def __iter__(self) -> Iterator[Batch]:
-        generator = torch.Generator().manual_seed(self.seed)
-        while True:
-            yield self._draw(generator)
+        for number in itertools.count(self.start):
+            state = np.random.SeedSequence((self.seed, number)).generate_state(1, np.uint64)
+            yield self._draw(torch.Generator().manual_seed(int(state[0] >> 1)))
 
     def _draw(self, generator: torch.Generator) -> Batch:
         def uniform(low: float, high: float, *shape: int) -> torch.Tensor:

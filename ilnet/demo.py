@@ -21,17 +21,13 @@ TOWN = "town01"
 _WAYPOINT = 400
 
 
-def _device() -> torch.device:
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-
-
 def _pair(mesh: Mesh, pose: torch.Tensor) -> tuple[Scan, Scan]:
     return simulate.simulate(mesh, INPUT, pose), simulate.simulate(mesh, OUTPUT, pose)
 
 
 def from_town() -> tuple[Scan, Scan]:
     """A scan of 16×1024 in the embedded town, and what 128×2048 rays measure there."""
-    street = data.street(TOWN, seed=0, device=_device())
+    street = data.street(TOWN, seed=0, device=simulate.best_device())
     return _pair(street.mesh, street.pose(_WAYPOINT))
 
 
@@ -49,7 +45,7 @@ def from_mesh(path: Path, at: tuple[float, float, float]) -> tuple[Scan, Scan]:
     if not all(map(math.isfinite, at)):
         raise ValueError(f"--at is {at}; it should be three finite numbers, metres in the mesh")
     vertices, triangles = meshes.read(path)
-    scan, truth = _pair(Mesh(vertices, triangles, _device()), simulate.pose(at))
+    scan, truth = _pair(Mesh(vertices, triangles, simulate.best_device()), simulate.pose(at))
     if not scan.ranges.any():
         low, high = (", ".join(f"{c:.1f}" for c in corner) for corner in (vertices.min(0), vertices.max(0)))
         raise ValueError(
@@ -71,10 +67,16 @@ def from_scan(path: Path, rows: int, sensor: str | None = None) -> tuple[Scan, S
         ValueError: If it is not a scan, or cannot be decimated so.
     """
     truth = scans.read(path, preset(sensor) if sensor else None)
-    truth = Scan(truth.ranges.to(_device()), truth.sensor)
+    truth = Scan(truth.ranges.to(simulate.best_device()), truth.sensor)
     scan = truth.decimate(rows)
     if rows == truth.sensor.shape[0]:
         raise ValueError(f"rows is {rows}, all the beams of {path}: keep fewer, so that there are some to predict")
+    limits = truth.sensor
+    if not ((truth.ranges >= limits.min_range) & (truth.ranges <= limits.max_range)).any():
+        raise ValueError(
+            f"{path}: no return lies within {limits.min_range:g} to {limits.max_range:g} m, "
+            f"the nearest at {truth.ranges[truth.ranges > 0].min():g}: are these metres?"
+        )
     if not scan.ranges.any():
         raise ValueError(f"{path}: the {rows} beams kept hold no return; keep more --rows")
     return scan, truth

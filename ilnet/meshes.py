@@ -21,7 +21,7 @@ def read(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
         path: The file; metres, z up.
 
     Returns:
-        vertices: (V, 3) float32.
+        vertices: (V, 3) float32, or float64 where the file holds that.
         triangles: (F, 3) int32.
 
     Raises:
@@ -30,12 +30,15 @@ def read(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: there is no such file; give the path of a mesh")
+        what = "is a folder" if path.is_dir() else "there is no such file"
+        raise FileNotFoundError(f"{path}: {what}; give the path of a mesh")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "mesh.npz"
-        subprocess.run([sys.executable, "-m", "ilnet.meshes", str(path), str(out)], capture_output=True, check=False)
-        if not out.is_file():
-            raise ValueError(f"{path}: not a mesh that PyVista reads, or cut short: open it in a mesh viewer to see")
+        command = [sys.executable, "-m", "ilnet.meshes", str(path), str(out)]
+        reader = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+        if reader.returncode:
+            reason = (reader.stderr.strip().splitlines() or ["it crashed"])[-1]
+            raise ValueError(f"{path}: not a mesh that PyVista reads, or cut short; its reader said: {reason}")
         with np.load(out) as arrays:
             vertices, triangles = arrays["vertices"], arrays["triangles"]
     if len(triangles) == 0:
@@ -54,7 +57,7 @@ def _convert(path: str, out: str) -> None:
 
     mesh = pyvista.wrap(pyvista.read(path)).extract_surface(algorithm=None).triangulate()
     triangles = mesh.regular_faces if mesh.n_cells else np.empty((0, 3))
-    np.savez(out, vertices=np.asarray(mesh.points, np.float32), triangles=np.asarray(triangles, np.int32))
+    np.savez(out, vertices=np.asarray(mesh.points), triangles=np.asarray(triangles, np.int32))
 
 
 if __name__ == "__main__":

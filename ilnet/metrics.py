@@ -4,9 +4,7 @@ import torch
 
 from ilnet.scan import Scan
 
-__all__ = ["NAMES", "VOXEL", "compare", "voxels"]
-
-NAMES = ("mae", "iou", "precision", "recall", "f1")
+__all__ = ["VOXEL", "compare", "voxels"]
 
 # Metres: edge length of the voxels (paper, Sec. III-B).
 VOXEL = 0.1

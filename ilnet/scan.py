@@ -70,10 +70,14 @@ class Scan:
         measured = self.ranges > 0
         return directions[measured] * self.ranges[measured, None]
 
-    def filled(self) -> torch.Tensor:
-        """Return what a network sees, (H, W) [m]: no return and ranges beyond `max_range` become `norm_range`."""
+    def filled(self, norm_range: float = 0.0) -> torch.Tensor:
+        """Return what a network sees, (H, W) [m]: no return and ranges beyond `max_range` become `norm_range`.
+
+        Args:
+            norm_range: what the network was trained with [m]; the larger of this and the sensor's is filled in.
+        """
         unseen = (self.ranges == 0) | (self.ranges > self.sensor.max_range)
-        return self.ranges.masked_fill(unseen, self.sensor.norm_range)
+        return self.ranges.masked_fill(unseen, max(norm_range, self.sensor.norm_range))
 
     def decimate(self, rows: int | None = None, columns: int | None = None) -> "Scan":
         """Return the scan of only some of the beams and columns; see `Sensor.decimation`."""

@@ -41,7 +41,8 @@ class Sensor:
             W >= 2. Spacing may be uneven. Stored unwrapped: monotonic.
         min_range: nearest range the sensor measures [m].
         max_range: farthest range the sensor measures [m].
-        norm_range: what a no-return is filled with before a network sees it [m]; 0 <= min < max <= norm.
+        norm_range: what a no-return is filled with before a network sees it [m]; 0 <= min < max < norm, else no
+            return would look like one.
         name: for messages and files.
 
     Raises:
@@ -89,9 +90,9 @@ class Sensor:
             )
 
         limits = {k: _limit(k, getattr(self, k)) for k in ("min_range", "max_range", "norm_range")}
-        if not 0 <= limits["min_range"] < limits["max_range"] <= limits["norm_range"]:
+        if not 0 <= limits["min_range"] < limits["max_range"] < limits["norm_range"]:
             got = ", ".join(f"{k}={v:g}" for k, v in limits.items())
-            raise ValueError(f"range limits must obey 0 <= min_range < max_range <= norm_range, got {got}")
+            raise ValueError(f"range limits must obey 0 <= min_range < max_range < norm_range, got {got}")
 
         for field, value in {"elevations": elevations, "azimuths": azimuths, **limits, "name": str(self.name)}.items():
             object.__setattr__(self, field, value)

@@ -6,10 +6,20 @@ from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 from kernels import Mesh
 
-__all__ = ["measure", "pose", "simulate"]
+__all__ = ["best_device", "measure", "pose", "simulate"]
 
 
-def pose(position: torch.Tensor | tuple[float, float, float], yaw=0.0, pitch=0.0, roll=0.0) -> torch.Tensor:
+Angle = float | torch.Tensor
+
+
+def best_device() -> torch.device:
+    """CUDA where there is a device, else the CPU: those that the kernels run on."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def pose(
+    position: torch.Tensor | tuple[float, float, float], yaw: Angle = 0.0, pitch: Angle = 0.0, roll: Angle = 0.0
+) -> torch.Tensor:
     """Builds the transform from the sensor frame to the world.
 
     Args:
@@ -22,8 +32,8 @@ def pose(position: torch.Tensor | tuple[float, float, float], yaw=0.0, pitch=0.0
         (..., 4, 4) float64.
     """
     position = torch.as_tensor(position, dtype=torch.float64)
-    yaw, pitch, roll = (torch.as_tensor(a, dtype=torch.float64) for a in (yaw, pitch, roll))
-    (cy, sy), (cp, sp), (cr, sr) = ((a.cos(), a.sin()) for a in (yaw, pitch, roll))
+    angles = (torch.as_tensor(a, dtype=torch.float64) for a in (yaw, pitch, roll))
+    (cy, sy), (cp, sp), (cr, sr) = ((a.cos(), a.sin()) for a in angles)
     rows = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, position[..., 0]],
         [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, position[..., 1]],

@@ -10,7 +10,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger
 from torch.utils.data import DataLoader
 
-from ilnet import data, metrics, models
+from ilnet import data, metrics, models, simulate
 from ilnet.scan import Scan
 from ilnet.sensor import preset
 
@@ -23,6 +23,9 @@ TOWN = "town01"
 TRAIN_SEEDS = (1, 2, 3, 4)
 HELD_OUT_SEED = 5
 HELD_OUT_SCANS = 8
+# Steps.
+VALIDATE_EVERY = 200
+CHECKPOINT_EVERY = 100
 
 
 @dataclass(frozen=True)
@@ -59,11 +62,16 @@ class Training(lightning.LightningModule):
         model: What is trained; it has a `norm_range`.
         held_out: Pairs of an input scan and the scan to be predicted.
         rate: Highest learning rate.
+        run: What tells this run from others; kept in its checkpoints.
     """
 
-    def __init__(self, model: models.ILN | models.LIIF, held_out: list[list[Scan]], rate: float):
+    def __init__(self, model: models.ILN | models.LIIF, held_out: list[list[Scan]], rate: float, run: dict[str, Any]):
         super().__init__()
-        self.model, self.held_out, self.rate = model, held_out, rate
+        self.model, self.held_out, self.rate, self.run = model, held_out, rate, run
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Lets `train` refuse to go on with a run of another kind."""
+        checkpoint["run"] = self.run
 
     def training_step(self, batch: data.Batch, index: int) -> torch.Tensor:
         """L1 between ranges scaled to [-1, 1]."""
@@ -89,21 +97,22 @@ class Training(lightning.LightningModule):
 def train(
     name: str, preset_name: str, out: Path, steps: int | None = None, seed: int = 0, **arguments: Any
 ) -> dict[str, float]:
-    """Trains a model and writes its weights and figures.
+    """Trains a model and writes its weights and figures; goes on where an interrupted run in `out` stopped.
 
     Args:
         name: One of `models.TRAINABLE`.
         preset_name: One of `PRESETS`.
-        out: Folder for `NAME.safetensors`, checkpoints and `metrics.csv`; training goes on from a checkpoint there.
+        out: Folder for `NAME.safetensors`, and below `NAME/` the checkpoint of an unfinished run and the figures of
+            each start, `from-step-N/metrics.csv`.
         steps: Overrides the preset's.
-        seed: Of the initial weights and the rays.
+        seed: Of the initial weights and the rays, 0 or more.
         **arguments: Override the model's.
 
     Returns:
-        The last figures on held-out scans.
+        The figures of the final weights on held-out scans.
 
     Raises:
-        ValueError: If there is no such model or preset.
+        ValueError: If there is no such model or preset, or `out` holds an interrupted run of another kind.
     """
     if preset_name not in PRESETS:
         raise ValueError(f"unknown preset {preset_name!r}; known are {', '.join(PRESETS)}")
@@ -111,43 +120,54 @@ def train(
         raise ValueError(f"model {name!r} cannot be trained; these can: {', '.join(models.TRAINABLE)}")
     size = PRESETS[preset_name]
     steps = size.steps if steps is None else steps
-    lightning.seed_everything(seed, verbose=False)
     arguments = {**size.arguments(name), **arguments}
+    run = {"preset": preset_name, "steps": steps, "seed": seed, **arguments}
+    last = out / name / "last.ckpt"
+    start = _steps_done(last, run)
+
+    device = simulate.best_device()
+    lightning.seed_everything(seed, verbose=False)
     model = models.create(name, **arguments)
     assert isinstance(model, models.ILN | models.LIIF)
-    rays = data.ContinuousRays(
-        [data.street(TOWN, s) for s in TRAIN_SEEDS], preset(INPUT), size.crops, size.columns, size.queries, seed
+    streets = [data.street(TOWN, s, device) for s in TRAIN_SEEDS]
+    rays = data.ContinuousRays(streets, preset(INPUT), size.crops, size.columns, size.queries, seed, start)
+    held_out = data.held_out_scans(
+        data.street(TOWN, HELD_OUT_SEED, device), HELD_OUT_SCANS, [preset(INPUT), preset(OUTPUT)]
     )
-    held_out = data.held_out_scans(data.street(TOWN, HELD_OUT_SEED), HELD_OUT_SCANS, [preset(INPUT), preset(OUTPUT)])
-    training = Training(model, held_out, size.rate)
+    training = Training(model, held_out, size.rate, run)
+    scans = DataLoader(range(len(held_out)), batch_size=None)  # type: ignore[arg-type]
     trainer = lightning.Trainer(
         max_steps=steps,
         precision="bf16-mixed",
-        accelerator="auto",
+        accelerator=device.type,
         devices=1,
-        val_check_interval=min(steps, 200),
+        val_check_interval=VALIDATE_EVERY,
         num_sanity_val_steps=0,
         log_every_n_steps=10,
-        logger=CSVLogger(out, name="", version=name),
-        callbacks=[ModelCheckpoint(out / name, filename="last", every_n_train_steps=100), TQDMProgressBar()],
+        logger=CSVLogger(out, name=name, version=f"from-step-{start}"),
+        callbacks=[
+            ModelCheckpoint(last.parent, last.stem, every_n_train_steps=CHECKPOINT_EVERY, enable_version_counter=False),
+            TQDMProgressBar(),
+        ],
         enable_model_summary=False,
     )
-    last = out / name / "last.ckpt"
-    trainer.fit(
-        training,
-        DataLoader(rays, batch_size=None),
-        DataLoader(range(len(held_out)), batch_size=None),  # type: ignore[arg-type]
-        ckpt_path=last if last.exists() else None,
-    )
-    figures = {key: round(float(value), 4) for key, value in trainer.callback_metrics.items() if key.startswith("val/")}
-    models.save(
-        model,
-        out / f"{name}.safetensors",
-        name,
-        arguments,
-        preset=preset_name,
-        steps=steps,
-        seed=seed,
-        held_out=figures,
-    )
+    trainer.fit(training, DataLoader(rays, batch_size=None), scans, ckpt_path=last if start else None)
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    figures = {key: round(value, 4) for key, value in trainer.validate(training, scans, verbose=False)[0].items()}
+    models.save(model, out / f"{name}.safetensors", name, arguments, **run, held_out=figures)
+    last.unlink(missing_ok=True)
     return figures
+
+
+def _steps_done(checkpoint: Path, run: dict[str, Any]) -> int:
+    """How far the interrupted run behind a checkpoint came; 0 where there is none. ValueError if it is not `run`."""
+    if not checkpoint.exists():
+        return 0
+    state = torch.load(checkpoint, weights_only=True, map_location="cpu")
+    if state["run"] != run:
+        raise ValueError(
+            f"{checkpoint} is an interrupted run of {state['run']}, not of {run}: "
+            "go on with that one, delete the file, or choose another --out"
+        )
+    return state["global_step"]

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.launch import check_backend, launch, overload
+from kernels.launch import check_backend, check_floating, launch, overload
 from kernels.neighbours import area, broadcast_batch, check_queries
 
 __all__ = ["area_blend"]
@@ -113,9 +113,7 @@ def area_blend(values: torch.Tensor, queries: torch.Tensor, backend: str = "warp
     Source: paper Eq. 2 (the weight function S_t / S).
     """
     check_backend(backend)
-    if not isinstance(values, torch.Tensor) or values.dtype not in _blend:
-        kind = getattr(values, "dtype", type(values).__name__)
-        raise TypeError(f"values is {kind}; it should be a floating-point tensor (..., Q, 4)")
+    check_floating("values", values, _blend, "(..., Q, 4)")
     check_queries(queries, values, "values")
     if values.ndim < 2 or values.shape[-2:] != (queries.shape[-2], 4):
         raise ValueError(f"values has shape {tuple(values.shape)}; it should be (..., {queries.shape[-2]}, 4)")

@@ -18,7 +18,7 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.launch import check_backend, launch, overload
+from kernels.launch import check_backend, check_floating, launch, overload
 
 __all__ = ["neighbour_attention"]
 
@@ -177,9 +177,7 @@ def neighbour_attention(qkv: torch.Tensor, heads: int, backend: str = "warp") ->
     Source: paper Sec. II-B, "Feature transformation using self-attention".
     """
     check_backend(backend)
-    if not isinstance(qkv, torch.Tensor) or qkv.dtype not in _attend:
-        kind = getattr(qkv, "dtype", type(qkv).__name__)
-        raise TypeError(f"qkv is {kind}; it should be a floating-point tensor (..., 4, 3·C)")
+    check_floating("qkv", qkv, _attend, "(..., 4, 3·C)")
     if qkv.ndim < 2 or qkv.shape[-2] != 4 or heads < 1 or qkv.shape[-1] == 0 or qkv.shape[-1] % (3 * heads):
         raise ValueError(
             f"qkv has shape {tuple(qkv.shape)}; it should be (..., 4, 3·C) with C a multiple of the {heads} heads"

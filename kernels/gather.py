@@ -6,7 +6,7 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.launch import check_backend, launch, overload
+from kernels.launch import check_backend, check_floating, launch, overload
 from kernels.neighbours import adjoint_of_gather, broadcast_batch, channel_span, check_queries, neighbour, offset
 
 __all__ = ["gather_neighbours"]
@@ -108,9 +108,7 @@ def gather_neighbours(
     Source: paper Sec. II-B, "Local feature extraction" (z_t, Δq_t).
     """
     check_backend(backend)
-    if not isinstance(features, torch.Tensor) or features.dtype not in _gather:
-        kind = getattr(features, "dtype", type(features).__name__)
-        raise TypeError(f"features is {kind}; it should be a floating-point tensor (..., C, H, W)")
+    check_floating("features", features, _gather, "(..., C, H, W)")
     if features.ndim < 3 or 0 in features.shape[-3:]:
         raise ValueError(f"features has shape {tuple(features.shape)}; it should be (..., C, H, W), none of them 0")
     check_queries(queries, features, "features")
@@ -120,4 +118,4 @@ def gather_neighbours(
         gathered, offsets = reference.gather_neighbours(features, queries, wrap)
     else:
         gathered, offsets = _gather_neighbours(features.movedim(1, 3).contiguous(), queries.contiguous(), wrap)
-    return gathered.reshape(*batch, *gathered.shape[1:]), offsets.reshape(*batch, *offsets.shape[1:])
+    return gathered.reshape(*batch, *gathered.shape[1:]), offsets.detach().reshape(*batch, *offsets.shape[1:])

@@ -20,7 +20,7 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.launch import check_backend, launch, overload
+from kernels.launch import check_backend, check_floating, launch, overload
 from kernels.neighbours import adjoint_of_gather, area, broadcast_batch, check_queries, neighbour
 from kernels.reference import PRIORS, RANGE_FLOOR
 
@@ -234,7 +234,7 @@ def gather_blend(
             but the perspective prior wants positive ranges and takes those below 0.1 as 0.1.
         queries: (..., Q, 2) pixel coordinates (row, column); integers are pixel centres.
         scores: (..., Q, 4), one per neighbour in the order (row-, col-), (row-, col+), (row+, col-), (row+, col+).
-            The leading dimensions of the three broadcast.
+            The leading dimensions of the three broadcast. Four scores of -inf give NaN.
         prior: What zero scores mean: "none" the mean of the neighbours (the paper), "bilinear" bilinear interpolation,
             "perspective" bilinear interpolation of inverse range, which keeps planes flat.
         wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
@@ -257,10 +257,8 @@ def gather_blend(
         raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}")
     if not 0 <= area_floor <= 0.25:
         raise ValueError(f"area_floor is {area_floor}; it should be between 0 and 0.25, the area at a cell's centre")
-    for name, tensor in (("image", image), ("scores", scores)):
-        if not isinstance(tensor, torch.Tensor) or tensor.dtype not in _blend:
-            kind = getattr(tensor, "dtype", type(tensor).__name__)
-            raise TypeError(f"{name} is {kind}; it should be a float32 or float64 tensor")
+    check_floating("image", image, _blend, "(..., H, W)")
+    check_floating("scores", scores, _blend, "(..., Q, 4)")
     if image.ndim < 2 or 0 in image.shape[-2:]:
         raise ValueError(f"image has shape {tuple(image.shape)}; it should be (..., H, W), neither of them 0")
     check_queries(queries, image, "image")

@@ -1,16 +1,18 @@
 """The one way a kernel is launched: torch tensors in, on their device, stream and CPU cores."""
 
-import functools
+import contextlib
 import itertools
 import os
+import tempfile
 import threading
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import torch
 import warp as wp
 
-__all__ = ["BACKENDS", "check_backend", "initialise", "launch", "overload"]
+__all__ = ["BACKENDS", "check_backend", "check_floating", "initialise", "launch", "overload"]
 
 BACKENDS = ("warp", "torch")
 
@@ -27,6 +29,7 @@ _DTYPES = {
     torch.float16: (wp.float16, wp.float32),
 }
 
+_initialised = False
 _lock = threading.Lock()
 _pools: dict[int, ThreadPoolExecutor] = {}
 
@@ -52,21 +55,40 @@ def _pool(cores: int) -> ThreadPoolExecutor:
         return _pools[cores]
 
 
-@functools.cache
 def initialise() -> None:
     """Starts Warp, once; everything that calls Warp before a launch calls this first."""
-    if torch.cuda.is_available():
-        wp.init()
-        return
-    # Without a driver Warp's native library warns on stderr at every start; who has no GPU knows.
-    stderr = os.dup(2)
-    with open(os.devnull, "w") as nowhere:
-        os.dup2(nowhere.fileno(), 2)
-    try:
-        wp.init()
-    finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
+    global _initialised
+    with _lock:
+        if not _initialised:
+            _start_warp()
+            _initialised = True
+
+
+def _start_warp() -> None:
+    with contextlib.ExitStack() as undo:
+        if not torch.cuda.is_available():
+            # Without a driver Warp's native library warns on stderr at every start; who has no GPU knows.
+            with contextlib.suppress(OSError):
+                stderr = os.dup(2)
+                undo.callback(os.close, stderr)
+                undo.callback(os.dup2, stderr, 2)
+                with open(os.devnull, "w") as nowhere:
+                    os.dup2(nowhere.fileno(), 2)
+        try:
+            wp.init()
+        except OSError:
+            # No home to keep compiled kernels in: they are compiled again in the next process.
+            wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="warp-")
+            wp.init()
+
+
+def check_floating(name: str, tensor: object, dtypes: Iterable[torch.dtype], shape: str) -> None:
+    """Raises TypeError unless `tensor`, the argument called `name`, is a tensor of one of `dtypes`."""
+    dtypes = list(dtypes)
+    if not isinstance(tensor, torch.Tensor) or tensor.dtype not in dtypes:
+        kind = getattr(tensor, "dtype", type(tensor).__name__)
+        known = ", ".join(str(dtype).removeprefix("torch.") for dtype in dtypes)
+        raise TypeError(f"{name} is {kind}; it should be a tensor {shape} of one of {known}")
 
 
 def check_backend(backend: str) -> None:
@@ -117,6 +139,8 @@ def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[tor
     """
     if threads == 0:
         return
+    if threads >= 2**31:
+        raise ValueError(f"{threads} threads are more than a kernel can count; split the queries")
     initialise()
     arguments = [
         wp.from_torch(a.detach(), requires_grad=False, return_ctype=True) if isinstance(a, torch.Tensor) else a
@@ -124,8 +148,9 @@ def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[tor
     ]
     device = outputs[0].device
     if device.type == "cuda":
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device))):
-            wp.launch(kernel, threads, inputs=[0, *arguments], device=wp.device_from_torch(device))
+        # Given the stream, Warp neither switches its own, which all Python threads share, nor waits for it.
+        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
+        wp.launch(kernel, threads, inputs=[0, *arguments], stream=stream, record_tape=False)
         return
 
     def run(bounds: tuple[int, int]) -> None:

@@ -18,8 +18,9 @@ __all__ = ["adjoint_of_gather", "area", "broadcast_batch", "channel_span", "chec
 
 @wp.func
 def base(coordinate: Any):
-    """The integer below a coordinate."""
-    return int(wp.floor(coordinate))
+    """The integer below a coordinate; absurd ones stay within what an int holds."""
+    limit = type(coordinate)(1073741824.0)  # 2^30
+    return int(wp.floor(wp.clamp(coordinate, -limit, limit)))
 
 
 @wp.func
@@ -110,7 +111,7 @@ def _number_cells_kernel(
 
 
 @wp.kernel(enable_backward=False)
-def _adjoint_of_gather_kernel(
+def _sum_gradients_kernel(
     first: int,
     # in
     gradients: wp.array4d[Any],
@@ -147,7 +148,7 @@ def _adjoint_of_gather_kernel(
 
 
 _number_cells = overload(_number_cells_kernel)
-_adjoint_of_gather = overload(_adjoint_of_gather_kernel)
+_sum_gradients = overload(_sum_gradients_kernel)
 
 
 @torch.library.custom_op("kernels::adjoint_of_gather", mutates_args=())
@@ -178,7 +179,7 @@ def adjoint_of_gather(
     pixels = gradients.new_empty(batch, height, width, channels)
     span = channel_span(channels, gradients.device)
     launch(
-        _adjoint_of_gather[gradients.dtype],
+        _sum_gradients[gradients.dtype],
         batch * height * width * -(-channels // span),
         [gradients, queries, order.to(torch.int32), starts, span, int(wrap)],
         [pixels],

@@ -6,11 +6,13 @@ import numpy as np
 import torch
 import warp as wp
 
-from kernels.launch import initialise, launch
+from kernels import reference
+from kernels.launch import check_backend, check_floating, initialise, launch
+from kernels.neighbours import broadcast_batch
 
 __all__ = ["Hits", "Mesh"]
 
-# Metres. A hit nearer than this is the sensor's own surface to float32; it also keeps "0 = none" unambiguous.
+# Metres. A nearer hit is reported at this range, since 0 means none.
 _LEAST_RANGE = 1e-6
 
 
@@ -40,7 +42,7 @@ def _cast_rays_kernel(
 ):
     i = first + wp.tid()
     origin = wp.vec3(origins[i, 0], origins[i, 1], origins[i, 2])
-    direction = wp.normalize(wp.vec3(directions[i, 0], directions[i, 1], directions[i, 2]))
+    direction = wp.vec3(directions[i, 0], directions[i, 1], directions[i, 2])
     hit = wp.mesh_query_ray(mesh, origin, direction, max_range)
     if hit.result:
         ranges_out[i] = wp.max(hit.t, _LEAST_RANGE)
@@ -59,13 +61,16 @@ class Mesh:
     consistently.
 
     Args:
-        vertices: (V, 3) floating-point, metres, in any frame; copied to float32.
+        vertices: (V, 3) floating-point, metres, in any frame. They are copied; float64 keeps its precision far from the
+            frame's origin (georeferenced meshes).
         triangles: (F, 3) integer, numbers of the vertices.
-        device: Where the mesh is kept and the rays are cast; a torch device or its name.
+        device: Where the mesh is kept and the rays are cast; a torch device or its name. On CUDA, keep the mesh until
+            the rays have been cast: its memory is not torch's, which would wait for the stream.
 
     Raises:
         TypeError: If an argument is not an array of numbers of the right kind.
-        ValueError: If the mesh is empty, a vertex is NaN or infinite, or an index is out of bounds.
+        ValueError: If the mesh is empty, a vertex is NaN or infinite, an index is out of bounds, or there is no such
+            device.
     """
 
     def __init__(
@@ -83,6 +88,7 @@ class Mesh:
             raise TypeError(f"vertices is {points.dtype}; it should be floating-point, in metres")
         if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
             raise TypeError(f"triangles is {faces.dtype}; it should be an integer type")
+        points, faces = points.detach(), faces.detach().to(torch.int64)
         if not (finite := points.isfinite().all(1)).all():
             raise ValueError(
                 f"vertices holds {int((~finite).sum())} NaN or infinite of {len(points)}; remove them first"
@@ -91,54 +97,69 @@ class Mesh:
             raise ValueError(
                 f"triangles runs from {int(faces.min())} to {int(faces.max())}; it should lie in 0..{len(points) - 1}"
             )
+        try:
+            self.device = torch.empty(0, device=device).device
+        except (RuntimeError, AssertionError) as error:
+            raise ValueError(f"device is {device!r}, which is not there: {str(error).splitlines()[0]}") from None
         initialise()
-        self.device = torch.device(device)
-        name = str(self.device)
+        # Rays are cast in float32, whose millimetres end 10 km from the origin: so the origin is the mesh's middle.
+        self._middle = ((points.amin(0) + points.amax(0)).double() / 2).round().to(self.device)
+        self._vertices = (points.to(self.device).double() - self._middle).float()
+        self._triangles = faces.to(self.device, torch.int32).contiguous()
         self._mesh = wp.Mesh(
-            points=wp.array(points.detach().cpu().float().numpy(), dtype=wp.vec3, device=name, copy=True),
-            indices=wp.array(faces.detach().cpu().int().numpy().reshape(-1), dtype=wp.int32, device=name, copy=True),
+            points=wp.from_torch(self._vertices, dtype=wp.vec3),
+            indices=wp.from_torch(self._triangles.view(-1), dtype=wp.int32),
         )
+        if self.device.type == "cuda":
+            wp.synchronize_device(str(self.device))  # it was built on Warp's stream, and is used on torch's
 
-    def cast(self, origins: torch.Tensor, directions: torch.Tensor, max_range: float) -> Hits:
+    def cast(self, origins: torch.Tensor, directions: torch.Tensor, max_range: float, backend: str = "warp") -> Hits:
         """Finds the nearest hit of each ray.
 
         Args:
             origins: (..., 3) floating-point, metres, in the frame of the vertices, on the mesh's device.
             directions: (..., 3) of any length but 0; leading dimensions broadcast against those of `origins`.
             max_range: Metres; farther surfaces are not seen.
+            backend: "warp", or "torch" for the plain twin in `kernels.reference`, which tries every triangle.
 
         Returns:
             Hits of the broadcast shape (...).
 
         Raises:
             TypeError: If rays are not floating-point tensors.
-            ValueError: If a shape or device does not fit, a ray is not finite, a direction has length 0, or
-                `max_range` is not positive.
+            ValueError: If a shape, device or backend does not fit, a ray is not finite, a direction has length 0, or
+                `max_range` is not a positive number.
         """
-        for name, rays in (("origins", origins), ("directions", directions)):
-            if not isinstance(rays, torch.Tensor) or not rays.is_floating_point():
-                kind = getattr(rays, "dtype", type(rays).__name__)
-                raise TypeError(f"{name} is {kind}; it should be a floating-point tensor (..., 3)")
-            if rays.ndim == 0 or rays.shape[-1] != 3:
-                raise ValueError(f"{name} has shape {tuple(rays.shape)}; it should be (..., 3)")
-            if rays.device.type != self.device.type:
-                raise ValueError(f"{name} is on {rays.device}, the mesh on {self.device}; they should be on one device")
-            if not rays.isfinite().all():
+        check_backend(backend)
+        for name, tensor in (("origins", origins), ("directions", directions)):
+            check_floating(name, tensor, (torch.float32, torch.float64, torch.float16, torch.bfloat16), "(..., 3)")
+            if tensor.ndim == 0 or tensor.shape[-1] != 3:
+                raise ValueError(f"{name} has shape {tuple(tensor.shape)}; it should be (..., 3)")
+            if tensor.device != self.device:
+                raise ValueError(
+                    f"{name} is on {tensor.device}, the mesh on {self.device}; they should be on one device"
+                )
+            if not tensor.isfinite().all():
                 raise ValueError(f"{name} holds NaN or infinite values")
         if not (directions != 0).any(-1).all():
             raise ValueError("directions holds a direction of length 0; each should point somewhere")
-        if not max_range > 0:
-            raise ValueError(f"max_range is {max_range}; it should be above 0 m")
-        origins, directions = torch.broadcast_tensors(origins.detach().float(), directions.detach().float())
-        batch = origins.shape[:-1]
-        origins, directions = origins.reshape(-1, 3), directions.reshape(-1, 3)
-        ranges = origins.new_empty(len(origins))
-        triangles = torch.empty_like(ranges, dtype=torch.int32)
-        cosines = torch.empty_like(ranges)
-        launch(
-            _cast_rays_kernel,
-            len(origins),
-            [self._mesh.id, origins, directions, float(max_range)],
-            [ranges, triangles, cosines],
+        if not isinstance(max_range, int | float) or not max_range > 0:
+            raise ValueError(f"max_range is {max_range}; it should be a number of metres above 0")
+        batch, (origins, directions) = broadcast_batch(
+            origins=(origins.detach(), 1), directions=(directions.detach(), 1)
         )
+        origins = (origins.double() - self._middle).float()
+        # Lengths are evened out before float32, which cannot hold the square of a very long or very short one.
+        directions = (directions / directions.abs().amax(-1, keepdim=True)).float()
+        directions = torch.nn.functional.normalize(directions, dim=-1).contiguous()
+        if backend == "torch":
+            ranges, triangles, cosines = reference.cast_rays(
+                self._vertices, self._triangles, origins, directions, max_range
+            )
+        else:
+            ranges = origins.new_empty(len(origins))
+            triangles = torch.empty_like(ranges, dtype=torch.int32)
+            cosines = torch.empty_like(ranges)
+            inputs = [self._mesh.id, origins, directions, float(max_range)]
+            launch(_cast_rays_kernel, len(origins), inputs, [ranges, triangles, cosines])
         return Hits(ranges.view(batch), triangles.view(batch), cosines.view(batch))

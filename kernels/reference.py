@@ -12,6 +12,7 @@ __all__ = [
     "RANGE_FLOOR",
     "area_blend",
     "areas",
+    "cast_rays",
     "gather_blend",
     "gather_neighbours",
     "neighbour_attention",
@@ -40,13 +41,14 @@ def neighbours(
         offsets: (..., 4, 2), query minus neighbour in pixels.
     """
     row, column = queries.unbind(-1)
-    below, left = row.floor(), column.floor()
+    # Absurd coordinates stay within what the kernels' integers hold.
+    below, left = (c.floor().nan_to_num(0).clamp(-(2**30), 2**30).long() for c in (row, column))
     rows = torch.stack([below, below, below + 1, below + 1], -1).clamp(0, height - 1)
     columns = torch.stack([left, left + 1, left, left + 1], -1)
     if not wrap:
         columns = columns.clamp(0, width - 1)
     offsets = torch.stack([row.unsqueeze(-1) - rows, column.unsqueeze(-1) - columns], -1)
-    return rows.long(), columns.long() % width, offsets
+    return rows, columns % width, offsets
 
 
 def areas(queries: torch.Tensor) -> torch.Tensor:
@@ -95,3 +97,37 @@ def neighbour_attention(qkv: torch.Tensor) -> torch.Tensor:
     q, k, v = qkv.unflatten(1, (4, 3)).unbind(2)
     logits = torch.einsum("nihd,njhd->nhij", q, k) / math.sqrt(qkv.shape[-1])
     return torch.einsum("nhij,njhd->nihd", logits.softmax(-1), v)
+
+
+def cast_rays(
+    vertices: torch.Tensor, triangles: torch.Tensor, origins: torch.Tensor, directions: torch.Tensor, max_range: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """`kernels.Mesh.cast` by intersecting every ray with every triangle (Möller and Trumbore 1997).
+
+    Args:
+        vertices: (V, 3) metres.
+        triangles: (F, 3) integer.
+        origins: (N, 3) metres.
+        directions: (N, 3) unit vectors.
+        max_range: Metres.
+
+    Returns:
+        ranges (N,), triangle numbers (N,) int32 and incidence cosines (N,).
+    """
+    a, b, c = vertices[triangles.long()].unbind(1)
+    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+    results = []
+    for start, direction in zip(origins.split(1024), directions.split(1024), strict=True):
+        across = torch.linalg.cross(direction[:, None], (c - a)[None])
+        determinant = ((b - a)[None] * across).sum(-1)
+        from_a = start[:, None] - a[None]
+        along = torch.linalg.cross(from_a, (b - a)[None].expand_as(from_a))
+        u = (from_a * across).sum(-1) / determinant
+        v = (direction[:, None] * along).sum(-1) / determinant
+        t = ((c - a)[None] * along).sum(-1) / determinant
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t <= max_range)
+        nearest, number = t.masked_fill(~hit, math.inf).min(1)
+        cosine = (normals[number] * direction).sum(-1).abs()
+        some = nearest.isfinite()
+        results.append((nearest.where(some, 0.0), number.where(some, -1).int(), cosine.where(some, 0.0)))
+    return tuple(torch.cat(parts) for parts in zip(*results, strict=True))  # type: ignore[return-value]

@@ -52,13 +52,16 @@ def save(model: Model, path: str | Path, name: str, arguments: dict[str, Any], *
         model: Whose weights are written.
         path: A `.safetensors` file; its folder is made.
         name: One of `NAMES`.
-        arguments: The constructor's arguments that differ from what the name stands for.
+        arguments: The constructor's arguments besides what the name stands for today, which is written as well.
         **card: How it was trained; JSON values.
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    about = {"name": name, "arguments": arguments, **card}
+    about = {"name": name, "arguments": {**_MODELS[name][1], **arguments}, **card}
     weights = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
-    save_file(weights, path, {key: json.dumps(value) for key, value in about.items()})
+    try:
+        save_file(weights, path, {key: json.dumps(value) for key, value in about.items()})
+    except SafetensorError as error:
+        raise OSError(f"{path}: cannot be written ({error})") from error
 
 
 def load(name: str | Path) -> Model:

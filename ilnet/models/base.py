@@ -21,6 +21,9 @@ class Model(nn.Module):
     A subclass brings `decode`, and `encode` where it extracts features.
     """
 
+    norm_range = 0.0
+    """Metres that the network sees as +1, and no return is filled with at least; 0 where it sees metres."""
+
     def encode(self, image: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Computes once per image what all queries share; the image itself where there is nothing to extract.
 
@@ -47,7 +50,14 @@ class Model(nn.Module):
 
         Returns:
             (B, Q) float32 metres.
+
+        Raises:
+            ValueError: If the shapes do not fit.
         """
+        if image.ndim != 3:
+            raise ValueError(f"image has shape {tuple(image.shape)}; it should be (B, H, W)")
+        if queries.ndim != 3 or queries.shape[0] != len(image) or queries.shape[2] != 2:
+            raise ValueError(f"queries has shape {tuple(queries.shape)}; it should be ({len(image)}, Q, 2)")
         return self.decode(self.encode(image, wrap), image, queries, wrap)
 
     @torch.no_grad()
@@ -64,7 +74,7 @@ class Model(nn.Module):
             (H, W) float32 metres on the scan's device; near `norm_range` means no return. Rays outside the field of
             view get the range of the outermost beam next to them.
         """
-        image = scan.filled().unsqueeze(0)
+        image = scan.filled(self.norm_range).unsqueeze(0)
         queries = scan.sensor.grid_queries(sensor).to(image.device).view(1, -1, 2)
         wrap = scan.sensor.wrap
         features = self.encode(image, wrap)

@@ -6,6 +6,7 @@ from torch import nn
 from ilnet.models.base import OFFSET_SCALE, Model, normalised
 from ilnet.models.encoder import Encoder
 from kernels import gather_blend, gather_neighbours, neighbour_attention
+from kernels.reference import PRIORS
 
 __all__ = ["ILN"]
 
@@ -62,6 +63,9 @@ class ILN(Model):
         area_floor: Least bilinear area in the prior, so that a measured pixel can be overruled.
         norm_range: Metres that the encoder sees as +1; no return is filled with it.
 
+    Raises:
+        ValueError: If the prior is unknown or the heads do not divide the features.
+
     Source: paper Sec. II-B, Figs. 2 and 3; sizes as in the authors' code. 1,244,673 parameters at D = 1.
     """
 
@@ -76,6 +80,10 @@ class ILN(Model):
         area_floor: float = 1e-4,
         norm_range: float = 100.0,
     ):
+        if prior not in PRIORS:
+            raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}")
+        if heads < 1 or features % heads:
+            raise ValueError(f"heads is {heads}; it should divide the {features} features")
         super().__init__()
         self.prior, self.area_floor, self.norm_range = prior, area_floor, norm_range
         self.encoder = Encoder(features, blocks)
@@ -97,5 +105,5 @@ class ILN(Model):
         z = z + self.position(offsets * OFFSET_SCALE)
         for block in self.blocks:
             z = block(z)
-        scores = self.head(z).squeeze(-1).float()
+        scores = self.head(z).squeeze(-1).to(image.dtype)
         return gather_blend(image, queries, scores, self.prior, wrap, area_floor=self.area_floor)

@@ -65,6 +65,12 @@ def test_the_seed_decides(streets):
     assert not torch.equal(first[0][1].ranges, first[1][1].ranges)
 
 
+def test_a_stream_can_start_anywhere(streets):
+    batches = [batch for _, batch in zip(range(4), rays(streets), strict=False)]
+    later = data.ContinuousRays(streets, SENSOR, crops=6, columns=64, queries=100, seed=0, start=3)
+    assert torch.equal(next(iter(later)).ranges, batches[3].ranges)
+
+
 def test_sensors_sway_and_stand_at_their_height(streets):
     """Straight ahead and down the range tells the height; its spread the pitch and the jitter."""
     heights = []

@@ -1,9 +1,11 @@
+import json
 import re
 
 import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from safetensors import safe_open
 
 from ilnet import demo, models
 from ilnet.models.encoder import Encoder
@@ -224,6 +226,51 @@ def test_weights_survive_a_round_trip(tmp_path):
     models.save(model, tmp_path / "a.safetensors", "iln", arguments, steps=3)
     image, queries = draw()
     assert torch.equal(models.load(tmp_path / "a.safetensors")(image, queries), model(image, queries))
+
+
+def test_a_sensor_of_short_range_shows_no_return_as_the_network_knows_it():
+    """Filled with the 60 m of its sensor, no return would look like a wall to a network trained with 100 m."""
+    sensor = Sensor(np.deg2rad([-10.0, 0.0, 10.0]), np.deg2rad(np.arange(0.0, 360.0, 20.0)), 2.0, 50.0, 60.0)
+    ranges = torch.full(sensor.shape, 20.0)
+    ranges[1:] = 0
+    model, seen = small(), []
+    model.encoder.register_forward_pre_hook(lambda module, arguments: seen.append(arguments[0]))
+    model.upsample(Scan(ranges, sensor), sensor)
+    assert seen[0].unique().tolist() == pytest.approx([20 / 50 - 1, 1.0])
+
+
+def test_weights_say_what_their_name_stood_for(tmp_path):
+    model = models.create("iln-prior", features=16, blocks=1, heads=4)
+    models.save(model, tmp_path / "a.safetensors", "iln-prior", {"features": 16, "blocks": 1, "heads": 4})
+    with safe_open(tmp_path / "a.safetensors", "pt") as file:
+        assert json.loads(file.metadata()["arguments"])["prior"] == model.prior
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"), [({"prior": "cubic"}, "prior is 'cubic'"), ({"heads": 7}, "heads is 7")]
+)
+def test_bad_constructor_arguments_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        models.ILN(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("image", "queries"), [((5, 6), (1, 7, 2)), ((1, 1, 5, 6), (1, 7, 2)), ((2, 5, 6), (7, 2)), ((2, 5, 6), (1, 7, 2))]
+)
+def test_bad_shapes_are_named(image, queries):
+    with pytest.raises(ValueError, match="has shape"):
+        models.create("bilinear")(torch.ones(image), torch.ones(queries))
+
+
+def test_double_precision():
+    model, (image, queries) = small().double(), draw()
+    assert model(image.double(), queries.double()).dtype == torch.float64
+
+
+def test_compiles_without_graph_breaks():
+    model, (image, queries) = small(), draw()
+    compiled = torch.compile(model, fullgraph=True, backend="aot_eager")
+    torch.testing.assert_close(compiled(image, queries), model(image, queries), rtol=0, atol=METRES)
 
 
 def test_bad_weights_are_refused(tmp_path):

@@ -136,7 +136,7 @@ def test_equality():
         ({"azimuths": np.arange(0, 360, 2.0)}, "azimuths must"),
         ({"elevations": [[0.1, 0.2]]}, r"elevations must be a 1-D table.*\(1, 2\)"),
         ({"elevations": "vlp-16"}, "elevations must be a 1-D table.*str"),
-        ({"min_range": -1}, "0 <= min_range < max_range <= norm_range, got min_range=-1"),
+        ({"min_range": -1}, "0 <= min_range < max_range < norm_range, got min_range=-1"),
         ({"min_range": 80}, "0 <= min_range < max_range"),
         ({"norm_range": 79}, "norm_range=79"),
         ({"max_range": math.nan}, "max_range must be finite"),

@@ -3,7 +3,7 @@ import csv
 import pytest
 import torch
 
-from ilnet import data, models, train
+from ilnet import data, metrics, models, train
 from ilnet.sensor import preset
 from ilnet.simulate import pose, simulate
 
@@ -16,7 +16,6 @@ def quick(monkeypatch, yard):
     monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
     size = train.Preset(blocks=1, steps=4, rate=1e-3, crops=2, columns=32, queries=64)
     monkeypatch.setitem(train.PRESETS, "tiny", size)
-    # CUDA or not, the figures of these tests do not depend on it.
     return lambda out, **options: train.train("iln-prior", "tiny", out, features=16, heads=4, **options)
 
 
@@ -25,7 +24,7 @@ def test_writes_weights_that_load_and_figures(tmp_path, quick):
     assert set(figures) == {f"val/{name}" for name in ("mae", "iou", "precision", "recall", "f1")}
     model = models.load(tmp_path / "iln-prior.safetensors")
     assert model.prior == models.create("iln-prior").prior
-    with open(tmp_path / "iln-prior" / "metrics.csv") as log:
+    with open(tmp_path / "iln-prior" / "from-step-0" / "metrics.csv") as log:
         assert any(row["val/iou"] for row in csv.DictReader(log))
 
 
@@ -38,12 +37,49 @@ def test_the_same_seed_gives_the_same_weights(tmp_path, quick):
     assert not torch.equal(weights[0]["position.weight"], weights[2]["position.weight"])
 
 
+def test_an_interrupted_run_goes_on_to_the_same_weights(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(train, "CHECKPOINT_EVERY", 2)
+    quick(tmp_path / "whole", steps=6)
+    with monkeypatch.context() as cut:
+        original = train.Training.training_step
+
+        def step_or_die(self, batch, index):
+            if self.global_step == 5:
+                raise SystemError("power cut")
+            return original(self, batch, index)
+
+        cut.setattr(train.Training, "training_step", step_or_die)
+        with pytest.raises(SystemError):
+            quick(tmp_path / "cut", steps=6)
+    assert (tmp_path / "cut" / "iln-prior" / "last.ckpt").exists()
+    with pytest.raises(ValueError, match="is an interrupted run of .*'steps': 6"):
+        quick(tmp_path / "cut", steps=8)
+    quick(tmp_path / "cut", steps=6)
+    whole, cut = (models.load(tmp_path / run / "iln-prior.safetensors").state_dict() for run in ("whole", "cut"))
+    assert all(torch.equal(whole[key], cut[key]) for key in whole)
+    # Both starts left their figures, and a finished run leaves no checkpoint to stumble over.
+    assert {p.name for p in (tmp_path / "cut" / "iln-prior").iterdir()} == {"from-step-0", "from-step-4"}
+
+
+def test_the_figures_are_those_of_the_final_weights(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(train, "VALIDATE_EVERY", 3)
+    figures = quick(tmp_path, steps=5)
+    model = models.load(tmp_path / "iln-prior.safetensors")
+    street = train.data.street()
+    sensors = [preset(train.INPUT), preset(train.OUTPUT)]
+    [[scan, truth]] = data.held_out_scans(street, 1, sensors)
+    # bfloat16 in training's validation, float32 here.
+    assert metrics.compare(model.ranges(scan, truth.sensor), truth)["mae"] == pytest.approx(
+        figures["val/mae"], rel=0.05
+    )
+
+
 def test_training_lowers_the_loss(yard):
     torch.manual_seed(0)
     model = models.create("iln", features=16, blocks=1, heads=4, dropout=0.0)
     street = data.Street(yard, torch.tensor([[3.0, 0, 0], [-3, 2, 0]]), torch.zeros(2))
     batch = next(iter(data.ContinuousRays([street], preset("paper-16x1024"), 4, 64, 256, seed=0)))
-    training = train.Training(model, [], rate=1e-3)
+    training = train.Training(model, [], 1e-3, {})
     training.log = lambda *args, **kwargs: None
     optimizer = torch.optim.Adam(model.parameters(), 3e-3)
     losses = []
@@ -58,7 +94,7 @@ def test_training_lowers_the_loss(yard):
 
 def test_the_loss_is_in_units_of_the_normalised_range(yard):
     model = models.create("iln", features=16, blocks=1, heads=4).eval()
-    training = train.Training(model, [], rate=1e-3)
+    training = train.Training(model, [], 1e-3, {})
     training.log = lambda *args, **kwargs: None
     batch = data.Batch(torch.full((1, 4, 8), 20.0), torch.rand(1, 5, 2) * 3, torch.full((1, 5), 70.0))
     assert training.training_step(batch, 0).item() == pytest.approx(50 * 2 / 100)

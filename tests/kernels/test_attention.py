@@ -42,6 +42,16 @@ def test_opcheck(device):
     torch.library.opcheck(_neighbour_attention, (draw(device, batch=(6,)).view(6, 12, 2, 5).requires_grad_(),))
 
 
+def test_compiles_without_graph_breaks(device):
+    results = []
+    for call in (neighbour_attention, torch.compile(neighbour_attention, fullgraph=True, backend="aot_eager")):
+        qkv = draw(device).requires_grad_()
+        attended = call(qkv, 2)
+        attended.sin().sum().backward()
+        results.append((attended.detach(), qkv.grad))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
 def test_equal_values_pass_through_and_huge_logits_choose(device):
     qkv = draw(device, batch=(7,), heads=2, width=5)
     qkv[..., 20:] = 3.5

@@ -80,6 +80,34 @@ def test_opcheck(device):
     torch.library.opcheck(_gather_neighbours, (features.movedim(1, 3).contiguous().requires_grad_(), queries, True))
 
 
+def test_offsets_carry_no_gradient(device):
+    features, queries = draw(5, 6, device)
+    for backend in ("warp", "torch"):
+        gathered, offsets = gather_neighbours(features.requires_grad_(), queries, backend=backend)
+        assert gathered.requires_grad
+        assert not offsets.requires_grad
+
+
+def test_absurd_queries_read_no_foreign_memory(device):
+    features, _ = draw(5, 6, device)
+    wild = torch.tensor([[1e12, -1e12], [-3e38, 3e38], [float("inf"), float("-inf")], [float("nan"), 2.0]])
+    for wrap in (True, False):
+        ours, twin = (gather_neighbours(features, wild.to(device), wrap, b)[0] for b in ("warp", "torch"))
+        assert torch.equal(ours[:, :3], twin[:, :3])
+        assert ours.isfinite().all()
+
+
+def test_compiles_without_graph_breaks(device):
+    features, queries = draw(5, 6, device)
+    results = []
+    for call in (gather_neighbours, torch.compile(gather_neighbours, fullgraph=True, backend="aot_eager")):
+        leaf = features.clone().requires_grad_()
+        gathered, _ = call(leaf, queries)
+        gathered.sin().sum().backward()
+        results.append((gathered.detach(), leaf.grad))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
 def test_memory_formats_batches_and_no_queries(device):
     features, queries = draw(5, 6, device)
     expected, _ = gather_neighbours(features, queries)

@@ -174,6 +174,17 @@ def test_backward_twice_gives_the_same_gradients_bit_for_bit(device):
     assert all(torch.equal(grads[0], g) for g in grads[1:])
 
 
+def test_compiles_without_graph_breaks(device):
+    image, queries, scores = draw(8, 16, device)
+    results = []
+    for call in (gather_blend, torch.compile(gather_blend, fullgraph=True, backend="aot_eager")):
+        leaves = [image.clone().requires_grad_(), scores.clone().requires_grad_()]
+        blended = call(leaves[0], queries, leaves[1], "perspective")
+        blended.sin().sum().backward()
+        results.append((blended.detach(), *(leaf.grad for leaf in leaves)))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
 def test_mutating_a_saved_input_raises(device):
     image, queries, scores = draw(4, 4, device)
     scores.requires_grad_()

@@ -33,23 +33,6 @@ def unit_vectors(count, seed=0):
     return torch.nn.functional.normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(seed)), dim=1)
 
 
-def brute_force(vertices, triangles, origins, directions, max_range):
-    """Möller-Trumbore for every ray and triangle, in float64: ranges and triangle numbers, 0 and -1 = none."""
-    a, b, c = vertices.double()[triangles].unbind(1)
-    directions = torch.nn.functional.normalize(directions.double(), dim=-1)
-    across = torch.linalg.cross(directions[:, None], (c - a)[None])
-    determinant = ((b - a)[None] * across).sum(-1)
-    to_origin = origins.double()[:, None] - a[None]
-    u = (to_origin * across).sum(-1) / determinant
-    along = torch.linalg.cross(to_origin, (b - a)[None].expand_as(to_origin))
-    v = (directions[:, None] * along).sum(-1) / determinant
-    t = ((c - a)[None] * along).sum(-1) / determinant
-    missed = ~((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t <= max_range))
-    nearest, number = t.masked_fill(missed, math.inf).min(1)
-    hit = nearest.isfinite()
-    return nearest.where(hit, 0.0), number.where(hit, -1)
-
-
 def test_plane(device):
     mesh = Mesh(*plane(), device)
     directions = unit_vectors(5000).to(device)
@@ -106,13 +89,38 @@ def test_matches_brute_force_on_a_triangle_soup(device, poisoned):
     vertices, triangles = soup(300)
     origins = (torch.rand(3000, 3, generator=torch.Generator().manual_seed(1)) - 0.5) * 20
     directions = unit_vectors(3000, seed=2) * torch.linspace(0.01, 100, 3000)[:, None]
-    hits = Mesh(vertices, triangles, device).cast(origins.to(device), directions.to(device), 8.0)
-    ranges, numbers = brute_force(vertices, triangles, origins, directions, 8.0)
+    rays = origins.to(device), directions.to(device), 8.0
+    hits, every = (Mesh(vertices, triangles, device).cast(*rays, backend=backend) for backend in ("warp", "torch"))
     # Rays within rounding of a triangle's rim or of the maximum range may go either way.
-    differ = hits.triangle.cpu() != numbers
-    assert differ.sum() <= 3
-    torch.testing.assert_close(hits.range.cpu().double()[~differ], ranges[~differ], rtol=1e-4, atol=METRES)
-    assert (ranges > 0).float().mean() > 0.1  # enough hits to mean something
+    same = hits.triangle == every.triangle
+    assert (~same).sum() <= 3
+    torch.testing.assert_close(hits.range[same], every.range[same], rtol=1e-4, atol=METRES)
+    torch.testing.assert_close(hits.cosine[same], every.cosine[same], rtol=0, atol=1e-3)
+    assert (every.range > 0).float().mean() > 0.1  # enough hits to mean something
+
+
+def test_the_reference_agrees_with_a_ray_by_hand():
+    hits = Mesh(*plane(z=2.0)).cast(torch.zeros(3), torch.tensor([[0.0, 3, 4], [0, 0, -1]]), 9.0, backend="torch")
+    torch.testing.assert_close(hits.range, torch.tensor([2.5, 0.0]))
+    torch.testing.assert_close(hits.cosine, torch.tensor([0.8, 0.0]))
+    assert hits.triangle[0] >= 0
+    assert hits.triangle[1] == -1
+
+
+def test_far_from_the_origin_of_a_map_millimetres_remain(device):
+    """UTM coordinates, in float64."""
+    east_north = torch.tensor([691_000.3, 5_336_000.7, 520.25], dtype=torch.float64)
+    vertices, triangles = box(3.3)
+    mesh = Mesh(vertices.double() + east_north, triangles, device)
+    hits = mesh.cast(east_north.to(device), torch.eye(3, dtype=torch.float64, device=device), 9.0)
+    torch.testing.assert_close(hits.range, torch.full((3,), 3.3, device=device), rtol=0, atol=METRES)
+
+
+@pytest.mark.parametrize("length", [1e-30, 1e-3, 1e30])
+def test_the_length_of_a_direction_does_not_matter(length, device):
+    down = torch.tensor([0.0, 0.6, -0.8], device=device) * length
+    hit = Mesh(*plane(), device).cast(torch.tensor([0.0, 0.0, 4.0], device=device), down, 9.0)
+    assert hit.range.item() == pytest.approx(5.0, abs=METRES)
 
 
 def test_back_faces_count(device):
@@ -137,9 +145,10 @@ def test_degenerate_triangles_do_no_harm(device):
     assert (hits.triangle >= 3).all()
 
 
-def test_accepts_numpy_integers_of_any_width_and_keeps_a_copy(device):
+@pytest.mark.parametrize("integer", [np.uint8, np.int16, np.uint16, np.uint32, np.int64, np.uint64])
+def test_accepts_numpy_integers_of_any_width_and_keeps_a_copy(integer, device):
     vertices, triangles = (a.numpy() for a in plane())
-    mesh = Mesh(vertices.astype(np.float64), triangles.astype(np.uint8), device)
+    mesh = Mesh(vertices.astype(np.float64), triangles.astype(integer), device)
     vertices += 1000
     hit = mesh.cast(torch.tensor([0.0, 0, 2], device=device), torch.tensor([0.0, 0, -1], device=device), 5.0)
     assert hit.range == 2
@@ -175,6 +184,12 @@ def test_bad_meshes_are_refused(message):
         Mesh(*bad_meshes()[message])
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_a_device_that_is_not_there_is_named():
+    with pytest.raises(ValueError, match="device is 'cuda', which is not there"):
+        Mesh(*plane(), device="cuda")
+
+
 @pytest.mark.parametrize(
     ("origins", "directions", "max_range", "message"),
     [
@@ -183,6 +198,8 @@ def test_bad_meshes_are_refused(message):
         (torch.tensor([0, 0, math.inf]), torch.ones(3), 5.0, "origins holds NaN or infinite"),
         (torch.zeros(2), torch.ones(3), 5.0, r"origins has shape \(2,\)"),
         (torch.zeros(3), torch.ones(3).int(), 5.0, "directions is torch.int32"),
+        (torch.zeros(2, 3), torch.ones(5, 3), 5.0, "do not broadcast: origins"),
+        (torch.zeros(3), torch.ones(3), None, "max_range is None"),
         (torch.zeros(3), torch.ones(3), 0.0, r"max_range is 0\.0"),
         (torch.zeros(3), torch.ones(3), math.nan, "max_range is nan"),
         ([0.0, 0.0, 0.0], torch.ones(3), 5.0, "origins is list"),
