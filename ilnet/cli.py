@@ -65,9 +65,7 @@ def demo(
 @click.argument("model")
 @click.option("--preset", default="tiny", show_default=True, help="Size of the network and of its training.")
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps, instead of the preset's.")
-@click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the initial weights and the rays."
-)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of weights and rays.")
 @click.option("--out", type=Path, default=Path("runs"), show_default=True, help="Folder for weights, figures, logs.")
 def train(model: str, preset: str, steps: int | None, seed: int, out: Path) -> None:
     """Train MODEL on rays cast at continuous directions; goes on where an interrupted run in --out stopped."""

@@ -135,7 +135,7 @@ def train(
         data.street(TOWN, HELD_OUT_SEED, device), HELD_OUT_SCANS, [preset(INPUT), preset(OUTPUT)]
     )
     training = Training(model, held_out, size.rate, run)
-    scans = DataLoader(range(len(held_out)), batch_size=None)  # type: ignore[arg-type]
+    scans: DataLoader[int] = DataLoader(range(len(held_out)), batch_size=None)  # type: ignore[arg-type]
     trainer = lightning.Trainer(
         max_steps=steps,
         precision="bf16-mixed",
