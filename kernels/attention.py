@@ -1,12 +1,9 @@
-"""neighbour_attention: multi-head self-attention among the 4 neighbours of each query (paper, Fig. 3b).
+"""attend_neighbours: multi-head self-attention among the 4 neighbours of each query (paper, Fig. 3b).
 
-For every query and head, with q, k, v the rows of the 4 neighbours and D their length:
+With q, k, v the 4 rows of one head and D their length, and backwards from the gradient G of the output:
 
     P = softmax(q kᵀ / √D),    out = P v
-
-and backwards, from the gradient G of the output, with S = P ∘ (G vᵀ - rowsum(P ∘ G vᵀ)):
-
-    ∂q = S k / √D,    ∂k = Sᵀ q / √D,    ∂v = Pᵀ G
+    S = P ∘ (G vᵀ - rowsum(P ∘ G vᵀ)),    ∂q = S k / √D,    ∂k = Sᵀ q / √D,    ∂v = Pᵀ G
 
 A 4×4 problem is far too small for a matrix library: one thread does one head of one query in registers.
 """
@@ -20,11 +17,12 @@ import warp as wp
 from kernels import reference
 from kernels.launch import check_backend, check_floating, launch, overload
 
-__all__ = ["neighbour_attention"]
+__all__ = ["adj_logits", "attend_neighbours", "softmax_rows"]
 
 
 @wp.func
-def _softmax_rows(logits: Any):
+def softmax_rows(logits: Any):
+    """P (4, 4) from q kᵀ / √D."""
     p = logits
     for i in range(4):
         largest = wp.max(wp.max(p[i, 0], p[i, 1]), wp.max(p[i, 2], p[i, 3]))
@@ -37,7 +35,7 @@ def _softmax_rows(logits: Any):
 
 
 @wp.func
-def _adj_logits(p: Any, adj_p: Any):
+def adj_logits(p: Any, adj_p: Any):
     """S from P and G vᵀ."""
     s = adj_p
     for i in range(4):
@@ -65,7 +63,7 @@ def _attention_map(qkv: wp.array4d[Any], n: int, h: int, scale: Any):
     logits = wp.matrix(shape=(4, 4), dtype=type(scale))
     for d in range(qkv.shape[3]):
         logits = logits + wp.outer(_four(qkv, n, 3, 0, h, d, scale) * scale, _four(qkv, n, 3, 1, h, d, scale))
-    return _softmax_rows(logits)
+    return softmax_rows(logits)
 
 
 @wp.kernel(enable_backward=False)
@@ -104,7 +102,7 @@ def _attend_neighbours_backward_kernel(
     adj_p = wp.matrix(shape=(4, 4), dtype=type(scale))
     for d in range(qkv.shape[3]):
         adj_p = adj_p + wp.outer(_four(adj_attended, n, 1, 0, h, d, scale), _four(qkv, n, 3, 2, h, d, scale))
-    s = _adj_logits(p, adj_p) * scale
+    s = adj_logits(p, adj_p) * scale
     for d in range(qkv.shape[3]):
         adj_q = s * _four(qkv, n, 3, 1, h, d, scale)
         adj_k = wp.transpose(s) * _four(qkv, n, 3, 0, h, d, scale)
@@ -119,29 +117,29 @@ _attend = overload(_attend_neighbours_kernel, half=True)
 _attend_backward = overload(_attend_neighbours_backward_kernel, half=True)
 
 
-@torch.library.custom_op("kernels::neighbour_attention", mutates_args=())
-def _neighbour_attention(qkv: torch.Tensor) -> torch.Tensor:
+@torch.library.custom_op("kernels::attend_neighbours", mutates_args=())
+def _attend_neighbours_op(qkv: torch.Tensor) -> torch.Tensor:
     count, _, heads, width = qkv.shape
     attended = qkv.new_empty(count, 4, heads, width)
     launch(_attend[qkv.dtype], count * heads, [qkv, 1 / math.sqrt(width)], [attended])
     return attended
 
 
-@_neighbour_attention.register_fake
+@_attend_neighbours_op.register_fake
 def _(qkv: torch.Tensor) -> torch.Tensor:
     count, _, heads, width = qkv.shape
     return qkv.new_empty(count, 4, heads, width)
 
 
-@torch.library.custom_op("kernels::neighbour_attention_backward", mutates_args=())
-def _neighbour_attention_backward(qkv: torch.Tensor, adj_attended: torch.Tensor) -> torch.Tensor:
+@torch.library.custom_op("kernels::attend_neighbours_backward", mutates_args=())
+def _attend_neighbours_backward_op(qkv: torch.Tensor, adj_attended: torch.Tensor) -> torch.Tensor:
     count, _, heads, width = qkv.shape
     adj_qkv = qkv.new_empty(qkv.shape)
     launch(_attend_backward[qkv.dtype], count * heads, [qkv, adj_attended, 1 / math.sqrt(width)], [adj_qkv])
     return adj_qkv
 
 
-@_neighbour_attention_backward.register_fake
+@_attend_neighbours_backward_op.register_fake
 def _(qkv: torch.Tensor, adj_attended: torch.Tensor) -> torch.Tensor:
     return qkv.new_empty(qkv.shape)
 
@@ -152,13 +150,13 @@ def _setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
 
 def _backward(ctx: Any, adj_attended: torch.Tensor) -> torch.Tensor:
     (qkv,) = ctx.saved_tensors
-    return _neighbour_attention_backward(qkv, adj_attended)
+    return _attend_neighbours_backward_op(qkv, adj_attended)
 
 
-_neighbour_attention.register_autograd(_backward, setup_context=_setup_context)
+_attend_neighbours_op.register_autograd(_backward, setup_context=_setup_context)
 
 
-def neighbour_attention(qkv: torch.Tensor, heads: int, backend: str = "warp") -> torch.Tensor:
+def attend_neighbours(qkv: torch.Tensor, heads: int, backend: str = "warp") -> torch.Tensor:
     """Lets the 4 neighbours of each query attend to each other.
 
     Args:
@@ -184,5 +182,5 @@ def neighbour_attention(qkv: torch.Tensor, heads: int, backend: str = "warp") ->
         )
     batch, width = qkv.shape[:-2], qkv.shape[-1] // (3 * heads)
     qkv = qkv.reshape(-1, 12, heads, width)
-    attended = reference.neighbour_attention(qkv) if backend == "torch" else _neighbour_attention(qkv.contiguous())
+    attended = reference.attend_neighbours(qkv) if backend == "torch" else _attend_neighbours_op(qkv.contiguous())
     return attended.reshape(*batch, 4, heads * width)

@@ -6,12 +6,14 @@ Shapes are those of the ops with the leading dimensions folded into one batch B;
 import math
 
 import torch
+import torch.nn.functional as F
 
 __all__ = [
     "PRIORS",
     "RANGE_FLOOR",
     "area_blend",
     "areas",
+    "attend_neighbours",
     "cast_rays",
     "gather_blend",
     "gather_neighbours",
@@ -92,11 +94,31 @@ def gather_blend(
     return (weights * ranges).sum(-1), weights
 
 
-def neighbour_attention(qkv: torch.Tensor) -> torch.Tensor:
-    """`kernels.neighbour_attention` on (N, 12, heads, D), the 4 neighbours' queries, keys and values in turn."""
+def attend_neighbours(qkv: torch.Tensor) -> torch.Tensor:
+    """`kernels.attend_neighbours` on (N, 12, heads, D), the 4 neighbours' queries, keys and values in turn."""
     q, k, v = qkv.unflatten(1, (4, 3)).unbind(2)
     logits = torch.einsum("nihd,njhd->nhij", q, k) / math.sqrt(qkv.shape[-1])
     return torch.einsum("nhij,njhd->nihd", logits.softmax(-1), v)
+
+
+def neighbour_attention(
+    pixels: torch.Tensor,
+    slope: torch.Tensor,
+    shift: torch.Tensor,
+    gram: torch.Tensor,
+    queries: torch.Tensor,
+    heads: int,
+    eps: float,
+    wrap: bool,
+) -> torch.Tensor:
+    """`kernels.neighbour_attention` on the parts of a `Projected` and queries (B, Q, 2)."""
+    channels = len(shift) // 3
+    gathered, q = gather_neighbours(pixels.movedim(3, 1), queries, wrap)
+    a, squares, u = gathered.split([3 * channels, 1, 2], -1)
+    variance = (squares + 2 * (q * u).sum(-1, keepdim=True) + ((q @ gram) * q).sum(-1, keepdim=True)) / channels
+    qkv = (a + q @ slope.T) / (variance + eps).sqrt() + shift
+    attended = attend_neighbours(qkv.reshape(-1, 12, heads, channels // heads))
+    return attended.reshape(*queries.shape[:2], 4, channels)
 
 
 def cast_rays(
@@ -115,7 +137,7 @@ def cast_rays(
         ranges (N,), triangle numbers (N,) int32 and incidence cosines (N,).
     """
     a, b, c = vertices[triangles.long()].unbind(1)
-    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+    normals = F.normalize(torch.linalg.cross(b - a, c - a), dim=1)
     results = []
     for start, direction in zip(origins.split(1024), directions.split(1024), strict=True):
         across = torch.linalg.cross(direction[:, None], (c - a)[None])

@@ -5,7 +5,7 @@ from torch import nn
 
 from ilnet.models.base import OFFSET_SCALE, Model, normalised
 from ilnet.models.encoder import Encoder
-from kernels import gather_blend, gather_neighbours, neighbour_attention
+from kernels import attend_neighbours, gather_blend, gather_neighbours
 from kernels.reference import PRIORS
 
 __all__ = ["ILN"]
@@ -23,7 +23,7 @@ class _Attention(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.dropout(self.out(neighbour_attention(self.qkv(self.norm(x)), self.heads)))
+        return self.dropout(self.out(attend_neighbours(self.qkv(self.norm(x)), self.heads)))
 
 
 class _FeedForward(nn.Sequential):

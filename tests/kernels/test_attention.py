@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from kernels import neighbour_attention
-from kernels.attention import _neighbour_attention
+from kernels import attend_neighbours
+from kernels.attention import _attend_neighbours_op
 
 # Half precision is rounded once on the way out by the kernel, several times on the way by plain PyTorch.
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12, torch.bfloat16: 6e-2, torch.float16: 8e-3}
@@ -19,7 +19,7 @@ def test_matches_the_reference_with_gradients(dtype, heads, width, device, poiso
     qkv = draw(device, dtype, heads=heads, width=width).requires_grad_()
     results = []
     for backend in ("warp", "torch"):
-        attended = neighbour_attention(qkv, heads, backend)
+        attended = attend_neighbours(qkv, heads, backend)
         (gradient,) = torch.autograd.grad((attended.float() * qkv[..., : heads * width].detach().float()).sum(), qkv)
         results.append((attended, gradient))
     for ours, reference in zip(*results, strict=True):
@@ -30,21 +30,21 @@ def test_matches_torchs_own_attention(device):
     qkv = draw(device, heads=8, width=8)
     q, k, v = qkv.unflatten(-1, (3, 8, 8)).transpose(-2, -4).unbind(-3)
     expected = torch.nn.functional.scaled_dot_product_attention(q, k, v).transpose(-2, -3).flatten(-2)
-    torch.testing.assert_close(neighbour_attention(qkv, 8), expected, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(attend_neighbours(qkv, 8), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_gradcheck(device):
     qkv = draw(device, torch.float64, batch=(3,), heads=2, width=3).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: neighbour_attention(x, 2), qkv)
+    assert torch.autograd.gradcheck(lambda x: attend_neighbours(x, 2), qkv)
 
 
 def test_opcheck(device):
-    torch.library.opcheck(_neighbour_attention, (draw(device, batch=(6,)).view(6, 12, 2, 5).requires_grad_(),))
+    torch.library.opcheck(_attend_neighbours_op, (draw(device, batch=(6,)).view(6, 12, 2, 5).requires_grad_(),))
 
 
 def test_compiles_without_graph_breaks(device):
     results = []
-    for call in (neighbour_attention, torch.compile(neighbour_attention, fullgraph=True, backend="aot_eager")):
+    for call in (attend_neighbours, torch.compile(attend_neighbours, fullgraph=True, backend="aot_eager")):
         qkv = draw(device).requires_grad_()
         attended = call(qkv, 2)
         attended.sin().sum().backward()
@@ -55,16 +55,16 @@ def test_compiles_without_graph_breaks(device):
 def test_equal_values_pass_through_and_huge_logits_choose(device):
     qkv = draw(device, batch=(7,), heads=2, width=5)
     qkv[..., 20:] = 3.5
-    torch.testing.assert_close(neighbour_attention(qkv, 2), torch.full((7, 4, 10), 3.5, device=device))
+    torch.testing.assert_close(attend_neighbours(qkv, 2), torch.full((7, 4, 10), 3.5, device=device))
     qkv[..., :20] *= 1e4
-    assert neighbour_attention(qkv, 2).isfinite().all()
+    assert attend_neighbours(qkv, 2).isfinite().all()
 
 
 def test_no_queries_and_strided_input(device):
-    assert neighbour_attention(draw(device)[:, :0], 2).shape == (3, 0, 4, 10)
+    assert attend_neighbours(draw(device)[:, :0], 2).shape == (3, 0, 4, 10)
     qkv = draw(device)
     strided = torch.stack([qkv, qkv], -1)[..., 0]
-    assert torch.equal(neighbour_attention(strided, 2), neighbour_attention(qkv, 2))
+    assert torch.equal(attend_neighbours(strided, 2), attend_neighbours(qkv, 2))
 
 
 @pytest.mark.parametrize(
@@ -78,4 +78,4 @@ def test_no_queries_and_strided_input(device):
 )
 def test_bad_arguments_are_named(qkv, heads, message):
     with pytest.raises((TypeError, ValueError), match=message):
-        neighbour_attention(qkv, heads)
+        attend_neighbours(qkv, heads)
