@@ -184,6 +184,18 @@ def test_upsample_does_not_depend_on_the_chunk(yard, monkeypatch):
     torch.testing.assert_close(model.ranges(scan, preset("paper-64x1024")), expected, rtol=0, atol=METRES)
 
 
+def test_upsample_decodes_in_pieces_of_bounded_size(yard):
+    from ilnet.models import base
+
+    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    model, sizes = models.create("bilinear"), []
+    decode = model.decode
+    model.decode = lambda e, i, queries, w: sizes.append(queries.shape[1]) or decode(e, i, queries, w)
+    model.ranges(scan, preset("paper-128x2048"))
+    assert sum(sizes) == 128 * 2048
+    assert max(sizes) == base._CHUNK["cpu"]
+
+
 def test_bilinear_upsampling_is_close_to_the_truth_on_the_ground(yard):
     here = pose((60.0, -60.0, 1.8))
     scan = simulate(yard, preset("paper-16x1024"), here)

@@ -1,0 +1,26 @@
+"""What can be said of CUDA where there is none: every kernel compiles for it."""
+
+import sys
+
+import pytest
+import warp as wp
+
+import kernels
+from kernels.launch import initialise
+
+MODULES = ["area_blend", "attention", "gather", "gather_blend", "hoisted_attention", "neighbours", "raycast"]
+
+
+def test_the_list_is_whole():
+    assert {f"kernels.{name}" for name in MODULES} == {
+        name for name in sys.modules if name.startswith("kernels.") and wp.get_module(name).kernels
+    }
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA compiler on macOS")
+@pytest.mark.parametrize("name", MODULES)
+def test_compiles_for_cuda(name, tmp_path):
+    initialise()
+    assert kernels.__all__  # imported: all overloads are made
+    wp.compile_aot_module(f"kernels.{name}", arch=80, module_dir=tmp_path, use_ptx=True)
+    assert any(file.suffix == ".ptx" and file.stat().st_size > 0 for file in tmp_path.iterdir())
