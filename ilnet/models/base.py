@@ -89,8 +89,8 @@ class Model(nn.Module):
             sensor: The sensor whose scan is wanted, in the same frame: any resolution, any tables.
 
         Returns:
-            A scan of `sensor`. Rays outside the field of view of the scan's sensor, and those predicted beyond
-            the maximum or below the minimum range of `sensor`, hold no return.
+            A scan of `sensor`. Rays outside the field of view of the scan's sensor, those predicted beyond the maximum
+            range of either, and those below the minimum range of `sensor`, hold no return.
         """
         return returns(self.ranges(scan, sensor), scan.sensor, sensor)
 
@@ -109,8 +109,9 @@ def returns(ranges: torch.Tensor, source: Sensor, sensor: Sensor) -> Scan:
         sensor: The sensor they were predicted for.
 
     Returns:
-        A scan of `sensor`; 0 outside the field of view of `source` and outside the range limits of `sensor`.
+        A scan of `sensor`; 0 outside the field of view of `source` and outside the range limits of `sensor`, and
+        beyond the maximum range of `source`, where a blend with no return lies.
     """
     seen = source.contains(source.grid_queries(sensor)).to(ranges.device)
-    valid = seen & (ranges >= sensor.min_range) & (ranges <= sensor.max_range)
+    valid = seen & (ranges >= sensor.min_range) & (ranges <= min(sensor.max_range, source.max_range))
     return Scan(ranges.where(valid, 0.0), sensor)

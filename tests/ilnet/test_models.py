@@ -215,6 +215,14 @@ def test_rays_out_of_view_hold_no_return(yard):
     assert (dense.ranges[1] > 0).all()
 
 
+@pytest.mark.parametrize("name", ["nearest", "bilinear", "bilinear-inverse", "iln"])
+def test_no_return_does_not_become_one_for_a_sensor_that_sees_farther(name):
+    near, far = preset("paper-16x1024"), preset("os1-128")
+    model = models.create(name, features=16, blocks=1) if name == "iln" else models.create(name)
+    assert far.max_range > near.norm_range
+    assert not model.eval().upsample(Scan(torch.zeros(near.shape), near), far).ranges.any()
+
+
 def test_a_scan_without_returns_gives_none():
     sensor = preset("paper-16x1024")
     empty = Scan(torch.zeros(sensor.shape), sensor)
