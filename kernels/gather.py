@@ -6,8 +6,8 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.launch import check_backend, check_floating, launch, overload
-from kernels.neighbours import adjoint_of_gather, broadcast_batch, channel_span, check_queries, neighbour, offset
+from kernels.launch import check_backend, check_floating, lanes, launch, overload_vectors
+from kernels.neighbours import adjoint_of_gather, broadcast_batch, channel_spans, check_queries, neighbour, offset
 
 __all__ = ["gather_neighbours"]
 
@@ -24,11 +24,11 @@ def _gather_neighbours_kernel(
     gathered_out: wp.array4d[Any],
     offsets_out: wp.array4d[wp.Float],
 ):
-    channels = features.shape[3]
-    spans = (channels + span - 1) // span
+    blocks = features.shape[3]
+    spans = (blocks + span - 1) // span
     thread = first + wp.tid()
     begin = (thread % spans) * span
-    end = wp.min(begin + span, channels)
+    end = wp.min(begin + span, blocks)
     t = (thread // spans) % 4
     q = (thread // spans // 4) % queries.shape[1]
     b = thread // spans // 4 // queries.shape[1]
@@ -43,7 +43,7 @@ def _gather_neighbours_kernel(
         offsets_out[b, q, t, 1] = dc
 
 
-_gather = overload(_gather_neighbours_kernel, half=True)
+_gather = overload_vectors(_gather_neighbours_kernel, half=True)
 
 
 @torch.library.custom_op("kernels::gather_neighbours", mutates_args=())
@@ -52,9 +52,10 @@ def _gather_neighbours(features: torch.Tensor, queries: torch.Tensor, wrap: bool
     count = queries.shape[1]
     gathered = features.new_empty(batch, count, 4, channels)
     offsets = queries.new_empty(batch, count, 4, 2)
-    span = channel_span(channels, features.device)
-    threads = batch * count * 4 * -(-channels // span)
-    launch(_gather[features.dtype], threads, [features, queries, span, int(wrap)], [gathered, offsets])
+    width = lanes(channels)
+    span, spans = channel_spans(channels // width, features.device)
+    inputs = [features, queries, span, int(wrap)]
+    launch(_gather[features.dtype, width], batch * count * 4 * spans, inputs, [gathered, offsets])
     return gathered, offsets
 
 
@@ -108,7 +109,7 @@ def gather_neighbours(
     Source: paper Sec. II-B, "Local feature extraction" (z_t, Δq_t).
     """
     check_backend(backend)
-    check_floating("features", features, _gather, "(..., C, H, W)")
+    check_floating("features", features, [dtype for dtype, _ in _gather], "(..., C, H, W)")
     if features.ndim < 3 or 0 in features.shape[-3:]:
         raise ValueError(f"features has shape {tuple(features.shape)}; it should be (..., C, H, W), none of them 0")
     check_queries(queries, features, "features")

@@ -12,7 +12,16 @@ from typing import Any
 import torch
 import warp as wp
 
-__all__ = ["BACKENDS", "check_backend", "check_floating", "initialise", "launch", "overload"]
+__all__ = [
+    "BACKENDS",
+    "check_backend",
+    "check_floating",
+    "initialise",
+    "lanes",
+    "launch",
+    "overload",
+    "overload_vectors",
+]
 
 BACKENDS = ("warp", "torch")
 
@@ -28,6 +37,9 @@ _DTYPES = {
     torch.bfloat16: (wp.bfloat16, wp.float32),
     torch.float16: (wp.float16, wp.float32),
 }
+
+# Channels that move together. 16 float32 are a cache line.
+_LANES = (1, 16)
 
 _initialised = False
 _lock = threading.Lock()
@@ -110,17 +122,58 @@ def overload(kernel: wp.Kernel, half: bool = False) -> dict[torch.dtype, wp.Kern
     Returns:
         The concrete kernel for each torch dtype of the stored tensors.
     """
-    dtypes = list(_DTYPES) if half else [torch.float32, torch.float64]
+    return {dtype: _concrete(kernel, *_DTYPES[dtype]) for dtype in _dtypes(half)}
 
-    def concrete(annotation: Any, stored: type, computed: type) -> Any:
-        known = {Any: stored, wp.Float: computed}
+
+def overload_vectors(kernel: wp.Kernel, half: bool = False) -> dict[tuple[torch.dtype, int], wp.Kernel]:
+    """The same for a kernel that moves whole vectors of channels: many times faster than number by number on a CPU.
+
+    The last dimension of a tensor of type `Any` is then counted in vectors; `launch` sees to it.
+
+    Args:
+        kernel: As for `overload`; what is of type `Any` is only copied and added.
+        half: As for `overload`.
+
+    Returns:
+        The concrete kernel for each torch dtype and each of the numbers of lanes that `lanes` chooses from.
+    """
+    return {
+        (dtype, n): _concrete(kernel, stored if n == 1 else wp.types.vector(n, stored), computed)
+        for dtype, (stored, computed) in _DTYPES.items()
+        if dtype in _dtypes(half)
+        for n in _LANES
+    }
+
+
+def lanes(channels: int) -> int:
+    """The most lanes of a vector that so many channels are a multiple of."""
+    return max(n for n in _LANES if channels % n == 0)
+
+
+def _dtypes(half: bool) -> list[torch.dtype]:
+    return list(_DTYPES) if half else [torch.float32, torch.float64]
+
+
+def _concrete(kernel: wp.Kernel, stored: type, computed: type) -> wp.Kernel:
+    known = {Any: stored, wp.Float: computed}
+
+    def concrete(annotation: Any) -> Any:
         if (dtype := getattr(annotation, "dtype", None)) in known:
             return wp.array(dtype=known[dtype], ndim=annotation.ndim)
         return known.get(annotation, annotation)
 
-    return {
-        dtype: wp.overload(kernel, [concrete(arg.type, *_DTYPES[dtype]) for arg in kernel.adj.args]) for dtype in dtypes
-    }
+    return wp.overload(kernel, [concrete(argument.type) for argument in kernel.adj.args])
+
+
+def _to_warp(argument: Any, annotation: Any) -> Any:
+    if not isinstance(argument, torch.Tensor):
+        return argument
+    dtype = getattr(annotation, "dtype", None)
+    width = getattr(dtype, "_length_", 1)
+    if width > 1:
+        argument = argument.unflatten(-1, (-1, width))
+        return wp.from_torch(argument.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+    return wp.from_torch(argument.detach(), requires_grad=False, return_ctype=True)
 
 
 def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[torch.Tensor]) -> None:
@@ -142,10 +195,8 @@ def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[tor
     if threads >= 2**31:
         raise ValueError(f"{threads} threads are more than a kernel can count; split the queries")
     initialise()
-    arguments = [
-        wp.from_torch(a.detach(), requires_grad=False, return_ctype=True) if isinstance(a, torch.Tensor) else a
-        for a in (*inputs, *outputs)
-    ]
+    annotations = [argument.type for argument in kernel.adj.args[1:]]
+    arguments = [_to_warp(a, t) for a, t in zip((*inputs, *outputs), annotations, strict=True)]
     device = outputs[0].device
     if device.type == "cuda":
         # Given the stream, Warp neither switches its own, which all Python threads share, nor waits for it.

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 import warp as wp
 
-from kernels.launch import launch, overload
+from kernels.launch import lanes, launch, overload, overload_vectors
 
-__all__ = ["adjoint_of_gather", "area", "broadcast_batch", "channel_span", "check_queries", "neighbour", "offset"]
+__all__ = ["adjoint_of_gather", "area", "broadcast_batch", "channel_spans", "check_queries", "neighbour", "offset"]
 
 
 @wp.func
@@ -115,7 +115,7 @@ def _sum_gradients_kernel(
     first: int,
     # in
     gradients: wp.array4d[Any],
-    queries: wp.array3d[Any],
+    queries: wp.array3d[wp.Float],
     order: wp.array2d[wp.int32],
     starts: wp.array2d[wp.int32],
     span: int,
@@ -133,8 +133,6 @@ def _sum_gradients_kernel(
     b = pixel // (height * width)
     i = (pixel // width) % height
     j = pixel % width
-    for c in range(begin, end):
-        pixels_out[b, i, j, c] = pixels_out.dtype(0.0)
     for k in range(4):
         n = cell_index(i, j, k, height, width, wrap)
         if n >= 0:
@@ -148,7 +146,7 @@ def _sum_gradients_kernel(
 
 
 _number_cells = overload(_number_cells_kernel)
-_sum_gradients = overload(_sum_gradients_kernel)
+_sum_gradients = overload_vectors(_sum_gradients_kernel)
 
 
 @torch.library.custom_op("kernels::adjoint_of_gather", mutates_args=())
@@ -176,11 +174,12 @@ def adjoint_of_gather(
     cells, order = torch.sort(cells, dim=1, stable=True)
     numbers = torch.arange((height + 1) * (width + 1) + 1, dtype=torch.int32, device=queries.device)
     starts = torch.searchsorted(cells, numbers.expand(batch, -1).contiguous(), out_int32=True)
-    pixels = gradients.new_empty(batch, height, width, channels)
-    span = channel_span(channels, gradients.device)
+    pixels = gradients.new_zeros(batch, height, width, channels)
+    lane = lanes(channels)
+    span, spans = channel_spans(channels // lane, gradients.device)
     launch(
-        _sum_gradients[gradients.dtype],
-        batch * height * width * -(-channels // span),
+        _sum_gradients[gradients.dtype, lane],
+        batch * height * width * spans,
         [gradients, queries, order.to(torch.int32), starts, span, int(wrap)],
         [pixels],
     )
@@ -192,9 +191,12 @@ def _(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, w
     return gradients.new_empty(gradients.shape[0], height, width, gradients.shape[3])
 
 
-def channel_span(channels: int, device: torch.device) -> int:
-    """How many channels a thread handles: all on a CPU core, one on a GPU, whose neighbouring threads read together."""
-    return 1 if device.type == "cuda" else channels
+def channel_spans(blocks: int, device: torch.device) -> tuple[int, int]:
+    """How many blocks of channels a thread handles, and how many threads that takes.
+
+    A CPU core handles all; on a GPU each thread handles one, since neighbouring threads read together.
+    """
+    return (1, blocks) if device.type == "cuda" else (blocks, 1)
 
 
 def check_queries(queries: torch.Tensor, like: torch.Tensor, name: str) -> None:

@@ -20,7 +20,7 @@ def draw(height, width, device, dtype=torch.float32, channels=9, count=257):
 
 
 @pytest.mark.parametrize(("height", "width", "wrap"), SIZES)
-@pytest.mark.parametrize("channels", [1, 9])
+@pytest.mark.parametrize("channels", [1, 9, 32])
 def test_matches_the_reference_with_gradients(height, width, wrap, channels, device, poisoned):
     features, queries = draw(height, width, device, channels=channels)
     features.requires_grad_()
