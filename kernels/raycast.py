@@ -106,12 +106,14 @@ class Mesh:
         self._middle = ((points.amin(0) + points.amax(0)).double() / 2).round().to(self.device)
         self._vertices = (points.to(self.device).double() - self._middle).float()
         self._triangles = faces.to(self.device, torch.int32).contiguous()
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)  # the copies ran on torch's stream, and the mesh is built on Warp's
         self._mesh = wp.Mesh(
             points=wp.from_torch(self._vertices, dtype=wp.vec3),
             indices=wp.from_torch(self._triangles.view(-1), dtype=wp.int32),
         )
         if self.device.type == "cuda":
-            wp.synchronize_device(str(self.device))  # it was built on Warp's stream, and is used on torch's
+            wp.synchronize_device(str(self.device))  # and used on torch's again
 
     def cast(self, origins: torch.Tensor, directions: torch.Tensor, max_range: float, backend: str = "warp") -> Hits:
         """Finds the nearest hit of each ray.

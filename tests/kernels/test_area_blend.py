@@ -46,6 +46,16 @@ def test_of_the_neighbours_own_ranges_is_bilinear(wrap, device):
     torch.testing.assert_close(area_blend(ranges.squeeze(-1), queries), bilinear)
 
 
+def test_compiles_without_graph_breaks(device):
+    results = []
+    for call in (area_blend, torch.compile(area_blend, fullgraph=True, backend="aot_eager")):
+        values, queries = draw(device)
+        blended = call(values.requires_grad_(), queries)
+        blended.sin().sum().backward()
+        results.append((blended.detach(), values.grad))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
 def test_constants_pass_and_a_pixel_centre_takes_its_own_value(device):
     values, queries = draw(device)
     torch.testing.assert_close(area_blend(torch.full_like(values, 2.5), queries), torch.full((2, 257), 2.5).to(device))

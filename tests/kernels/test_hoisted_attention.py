@@ -61,6 +61,20 @@ def test_neighbour_attention_passes_gradcheck_and_opcheck(device):
     torch.library.opcheck(_neighbour_attention, (pixels, queries, *rest, HEADS, 1e-5, True))
 
 
+def test_compiles_without_graph_breaks(device):
+    def step(features, queries, position, norm, qkv_weight):
+        return neighbour_attention(project_pixels(features, position, norm, qkv_weight), queries, HEADS)
+
+    results = []
+    for call in (step, torch.compile(step, fullgraph=True, backend="aot_eager")):
+        features, *others = draw_step(device)
+        attended = call(features.requires_grad_(), *others)
+        attended.sin().sum().backward()
+        results.append((attended.detach(), features.grad))
+    for ours, compiled in zip(*results, strict=True):
+        torch.testing.assert_close(ours, compiled)
+
+
 def test_neighbour_attention_without_queries_and_deterministic(device):
     features, queries, position, norm, qkv_weight = draw_step(device, torch.float32, count=3000)
     projected = project_pixels(features.requires_grad_(), position, norm, qkv_weight)
