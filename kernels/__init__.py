@@ -4,7 +4,7 @@ from kernels.area_blend import area_blend
 from kernels.attention import attend_neighbours
 from kernels.gather import gather_neighbours
 from kernels.gather_blend import gather_blend
-from kernels.hoisted_attention import Projected, neighbour_attention, project_pixels
+from kernels.neighbour_attention import Projected, neighbour_attention, project_pixels
 from kernels.raycast import Hits, Mesh
 
 __all__ = [

@@ -169,14 +169,15 @@ def _to_warp(argument: Any, annotation: Any) -> Any:
     if not isinstance(argument, torch.Tensor):
         return argument
     dtype = getattr(annotation, "dtype", None)
-    width = getattr(dtype, "_length_", 1)
-    if width > 1:
-        argument = argument.unflatten(-1, (-1, width))
+    if hasattr(dtype, "_length_"):
+        argument = argument.unflatten(-1, (-1, dtype._length_))
         return wp.from_torch(argument.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
     return wp.from_torch(argument.detach(), requires_grad=False, return_ctype=True)
 
 
-def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[torch.Tensor]) -> None:
+def launch(
+    kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[torch.Tensor], least: int = _MIN_CHUNK
+) -> None:
     """Runs `threads` threads of a kernel on the device of its outputs and waits for nothing but CPU work.
 
     A kernel's first argument is `first: int`, the number of its first thread: Warp runs a CPU launch on one core,
@@ -189,6 +190,7 @@ def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[tor
         threads: How many threads to run.
         inputs: The kernel's arguments after `first`: tensors, numbers, Warp handles.
         outputs: Tensors the kernel writes, all on one device.
+        least: Fewest threads that are worth a core of their own.
     """
     if threads == 0:
         return
@@ -208,7 +210,7 @@ def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[tor
         wp.launch(kernel, bounds[1] - bounds[0], inputs=[bounds[0], *arguments], device="cpu", record_tape=False)
 
     cores = torch.get_num_threads()
-    pieces = min(cores * _CHUNKS_PER_CORE, threads // _MIN_CHUNK)
+    pieces = min(cores * _CHUNKS_PER_CORE, threads // least)
     if cores == 1 or pieces < 2:
         run((0, threads))
         return

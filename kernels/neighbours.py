@@ -13,7 +13,16 @@ import warp as wp
 
 from kernels.launch import lanes, launch, overload, overload_vectors
 
-__all__ = ["adjoint_of_gather", "area", "broadcast_batch", "channel_spans", "check_queries", "neighbour", "offset"]
+__all__ = [
+    "adjoint_of_gather",
+    "area",
+    "broadcast_batch",
+    "channel_spans",
+    "check_queries",
+    "neighbour",
+    "offset",
+    "sort_queries",
+]
 
 
 @wp.func
@@ -147,6 +156,29 @@ def _sum_gradients_kernel(
 
 _number_cells = overload(_number_cells_kernel)
 _sum_gradients = overload_vectors(_sum_gradients_kernel)
+
+
+def sort_queries(queries: torch.Tensor, height: int, width: int, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    """Sorts the queries of all images by cell.
+
+    Args:
+        queries: (B, Q, 2) pixel coordinates.
+        height: Rows H of the image.
+        width: Columns W of the image.
+        wrap: Whether columns wrap around the seam.
+
+    Returns:
+        order: (B·Q,) int32 numbers b·Q + q of the queries, cell by cell.
+        starts: (B·(H + 1)·(W + 1) + 1,) int32, where in `order` the queries of each cell begin.
+    """
+    batch, count, _ = queries.shape
+    cells = torch.empty(batch, count, dtype=torch.int32, device=queries.device)
+    launch(_number_cells[queries.dtype], batch * count, [queries, height, width, int(wrap)], [cells])
+    per_image = (height + 1) * (width + 1)
+    cells = cells + per_image * torch.arange(batch, dtype=torch.int32, device=queries.device).unsqueeze(1)
+    cells, order = torch.sort(cells.view(-1), stable=True)
+    numbers = torch.arange(batch * per_image + 1, dtype=torch.int32, device=queries.device)
+    return order.to(torch.int32), torch.searchsorted(cells, numbers, out_int32=True)
 
 
 @torch.library.custom_op("kernels::adjoint_of_gather", mutates_args=())

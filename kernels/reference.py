@@ -103,22 +103,25 @@ def attend_neighbours(qkv: torch.Tensor) -> torch.Tensor:
 
 def neighbour_attention(
     pixels: torch.Tensor,
+    queries: torch.Tensor,
     slope: torch.Tensor,
     shift: torch.Tensor,
     gram: torch.Tensor,
-    queries: torch.Tensor,
+    weight: torch.Tensor,
+    bias: torch.Tensor,
     heads: int,
     eps: float,
     wrap: bool,
 ) -> torch.Tensor:
-    """`kernels.neighbour_attention` on the parts of a `Projected` and queries (B, Q, 2)."""
-    channels = len(shift) // 3
+    """`kernels.neighbour_attention` on the tensors of a `Projected`, queries (B, Q, 2) and weights for channels [d][head]."""
+    channels = len(bias)
     gathered, q = gather_neighbours(pixels.movedim(3, 1), queries, wrap)
-    a, squares, u = gathered.split([3 * channels, 1, 2], -1)
+    a, squares, u, _ = gathered.split([4 * channels, 1, 2, gathered.shape[-1] - 4 * channels - 3], -1)
+    qkv, tokens = (a + q @ slope).split([3 * channels, channels], -1)
     variance = (squares + 2 * (q * u).sum(-1, keepdim=True) + ((q @ gram) * q).sum(-1, keepdim=True)) / channels
-    qkv = (a + q @ slope.T) / (variance + eps).sqrt() + shift
-    attended = attend_neighbours(qkv.reshape(-1, 12, heads, channels // heads))
-    return attended.reshape(*queries.shape[:2], 4, channels)
+    qkv = qkv / (variance + eps).sqrt() + shift
+    attended = attend_neighbours(qkv.reshape(-1, 12, channels // heads, heads).transpose(2, 3))
+    return tokens + F.linear(attended.transpose(2, 3).reshape(tokens.shape), weight, bias)
 
 
 def cast_rays(
