@@ -2,17 +2,21 @@
 
 from kernels.area_blend import area_blend
 from kernels.attention import attend_neighbours
+from kernels.fused_decoder import DecoderWeights, fused_decode, fused_decode_serves
 from kernels.gather import gather_neighbours
 from kernels.gather_blend import gather_blend
 from kernels.neighbour_attention import Projected, neighbour_attention, project_pixels
 from kernels.raycast import Hits, Mesh
 
 __all__ = [
+    "DecoderWeights",
     "Hits",
     "Mesh",
     "Projected",
     "area_blend",
     "attend_neighbours",
+    "fused_decode",
+    "fused_decode_serves",
     "gather_blend",
     "gather_neighbours",
     "neighbour_attention",

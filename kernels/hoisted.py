@@ -15,9 +15,9 @@ Backwards, with G the gradient of the attended values, P the attention map and S
 gradients of q, k and v are S k, Sᵀ q and Pᵀ G; divided by σ they belong to A + B q; their products with A + B q add up
 to the gradient of 1/σ, and so of xᵀx, u and N.
 
-Channels are stored [d][head], so that consecutive ones belong to different heads. A CPU core takes 16 at a time, two d of
-8 heads (`kernels.lanes`), all heads in one group; a GPU thread takes one head, its neighbours the others, and each head is
-a group.
+Channels are stored [d][head], so that consecutive ones belong to different heads. A CPU core takes 16 at a time, two d
+of 8 heads (`kernels.lanes`), all heads in one group; a GPU thread takes one head, its neighbours the others, and each
+head is a group.
 """
 
 from typing import Any

@@ -118,7 +118,7 @@ def _add_product(sum: _wide, x: _wide, factor: float) -> _wide:
 
 @wp.func
 def add_products(x: wp.array2d[float], weight: wp.array2d[_wide], row: int, y_out: wp.array2d[_wide]):
-    """Adds X W to Y in rows `row` to `row` + 3. W (K, N) has whole blocks of 4 vectors in a row; X is read as numbers."""
+    """Adds X W to Y in rows `row` to `row` + 3. W (K, N) has whole blocks of 4 vectors a row; X is read as numbers."""
     for block in range(0, weight.shape[1], 4):
         y = zeros16(_wide())
         for t in range(4):

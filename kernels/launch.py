@@ -169,8 +169,10 @@ def _to_warp(argument: Any, annotation: Any) -> Any:
     if not isinstance(argument, torch.Tensor):
         return argument
     dtype = getattr(annotation, "dtype", None)
-    if hasattr(dtype, "_length_"):
-        argument = argument.unflatten(-1, (-1, dtype._length_))
+    if shape := getattr(dtype, "_shape_", ()):
+        argument = argument.unflatten(-1, (-1, *shape))
+        if shape == (1,):  # a dimension of one element may have any stride; one that torch adds has the one Warp wants
+            argument = argument.squeeze(-1).unsqueeze(-1)
         return wp.from_torch(argument.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
     return wp.from_torch(argument.detach(), requires_grad=False, return_ctype=True)
 

@@ -340,7 +340,9 @@ def neighbour_attention(
     dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else pixels.dtype
     queries = queries.detach().to(pixels.dtype)
     weight = output[0].to(pixels.dtype)[:, head_last(channels, heads, pixels.device)]
-    arguments = [pixels.contiguous(), queries.contiguous(), slope, shift, gram, weight, output[1].to(pixels.dtype)]
+    bias = output[1].to(pixels.dtype)
+    pixels, queries = pixels.contiguous(), queries.contiguous()
     if backend == "torch":
-        return reference.neighbour_attention(*arguments, heads, eps, wrap).to(dtype)
-    return _neighbour_attention(*arguments, heads, eps, wrap, dtype)
+        step = reference.neighbour_attention(pixels, queries, slope, shift, gram, weight, bias, heads, eps, wrap)
+        return step.to(dtype)
+    return _neighbour_attention(pixels, queries, slope, shift, gram, weight, bias, heads, eps, wrap, dtype)

@@ -4,6 +4,7 @@ Shapes are those of the ops with the leading dimensions folded into one batch B;
 """
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +16,7 @@ __all__ = [
     "areas",
     "attend_neighbours",
     "cast_rays",
+    "fused_decode",
     "gather_blend",
     "gather_neighbours",
     "neighbour_attention",
@@ -113,7 +115,7 @@ def neighbour_attention(
     eps: float,
     wrap: bool,
 ) -> torch.Tensor:
-    """`kernels.neighbour_attention` on the tensors of a `Projected`, queries (B, Q, 2) and weights for channels [d][head]."""
+    """`kernels.neighbour_attention` on the tensors of a `Projected`, queries (B, Q, 2) and a weight for [d][head]."""
     channels = len(bias)
     gathered, q = gather_neighbours(pixels.movedim(3, 1), queries, wrap)
     a, squares, u, _ = gathered.split([4 * channels, 1, 2, gathered.shape[-1] - 4 * channels - 3], -1)
@@ -122,6 +124,29 @@ def neighbour_attention(
     qkv = qkv / (variance + eps).sqrt() + shift
     attended = attend_neighbours(qkv.reshape(-1, 12, channels // heads, heads).transpose(2, 3))
     return tokens + F.linear(attended.transpose(2, 3).reshape(tokens.shape), weight, bias)
+
+
+def fused_decode(
+    projected: Any,
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    weights: Any,
+    prior: str,
+    wrap: bool,
+    area_floor: float,
+    eps: float,
+) -> torch.Tensor:
+    """`kernels.fused_decode`: a `Projected`, image (B, H, W), queries (B, Q, 2) and `DecoderWeights`."""
+    pixels, slope, shift, gram, heads = projected
+    weight, bias = weights.output
+    weight = weight[:, torch.arange(len(bias), device=bias.device).view(heads, -1).T.reshape(-1)]
+    t = neighbour_attention(pixels, queries.to(pixels.dtype), slope, shift, gram, weight, bias, heads, eps, wrap)
+    hidden = F.gelu(F.linear(F.layer_norm(t, bias.shape, weights.norm[0], weights.norm[1], eps), *weights.hidden))
+    t = t + F.linear(hidden, *weights.back)
+    scores = F.linear(
+        F.layer_norm(t, bias.shape, weights.head_norm[0], weights.head_norm[1], eps), *weights.score
+    ).squeeze(-1)
+    return gather_blend(image, queries, scores, prior, wrap, area_floor)[0]
 
 
 def cast_rays(

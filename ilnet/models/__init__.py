@@ -7,12 +7,26 @@ from typing import Any
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
-from ilnet.models.base import Model, returns
+from ilnet.models.base import PRECISIONS, Model, Upsampler, returns
 from ilnet.models.bilinear import Bilinear, Nearest
 from ilnet.models.iln import ILN
 from ilnet.models.liif import LIIF
 
-__all__ = ["ILN", "LIIF", "NAMES", "TRAINABLE", "Bilinear", "Model", "Nearest", "create", "load", "returns", "save"]
+__all__ = [
+    "ILN",
+    "LIIF",
+    "NAMES",
+    "PRECISIONS",
+    "TRAINABLE",
+    "Bilinear",
+    "Model",
+    "Nearest",
+    "Upsampler",
+    "create",
+    "load",
+    "returns",
+    "save",
+]
 
 # What `iln-prior` adds to the paper's network was chosen on scans held out of the training towns.
 _MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {

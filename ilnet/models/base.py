@@ -1,18 +1,22 @@
 """What all models share: one call, and the path from a scan to a denser scan."""
 
+from typing import Any
+
 import torch
 from torch import nn
 
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 
-__all__ = ["OFFSET_SCALE", "Model", "normalised", "returns"]
+__all__ = ["OFFSET_SCALE", "PRECISIONS", "Model", "Upsampler", "normalised", "returns"]
 
 # The authors measure offsets in half pixels; their checkpoints are worth the factor.
 OFFSET_SCALE = 2.0
 
+PRECISIONS = ("float32", "bfloat16")
+
 # Queries decoded at a time: the activations of so many fit the cache of a CPU core.
-_CHUNK = {"cpu": 4096, "cuda": 65536}
+_TILE = {"cpu": 4096, "cuda": 65536}
 
 
 class Model(nn.Module):
@@ -24,7 +28,10 @@ class Model(nn.Module):
     norm_range = 0.0
     """Metres that the network sees as +1, and no return is filled with at least; 0 where it sees metres."""
 
-    def encode(self, image: torch.Tensor, wrap: bool) -> torch.Tensor:
+    backend = "warp"
+    """Of the ops: "warp", or "torch" for their plain twins (`kernels.reference`)."""
+
+    def encode(self, image: torch.Tensor, wrap: bool) -> Any:
         """Computes once per image what all queries share; the image itself where there is nothing to extract.
 
         Args:
@@ -32,13 +39,17 @@ class Model(nn.Module):
             wrap: Whether column W-1 meets column 0.
 
         Returns:
-            Features (B, C, H, W), or the image.
+            What `decode` takes: features (B, C, H, W) with what belongs to them, or the image.
         """
         return image
 
-    def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
-        """Answers queries (B, Q, 2) with ranges (B, Q) [m], from the features and the image that gave them."""
+    def decode(self, encoded: Any, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+        """Answers queries (B, Q, 2) with ranges (B, Q) [m], from what `encode` made of the image."""
         raise NotImplementedError
+
+    def tile(self, encoded: Any) -> int | None:
+        """How many queries `Upsampler` gives to `decode` at a time; None for all."""
+        return _TILE[next((p.device.type for p in self.parameters()), "cpu")]
 
     def forward(self, image: torch.Tensor, queries: torch.Tensor, wrap: bool = True) -> torch.Tensor:
         """Predicts the range along each queried direction.
@@ -60,39 +71,119 @@ class Model(nn.Module):
             raise ValueError(f"queries has shape {tuple(queries.shape)}; it should be ({len(image)}, Q, 2)")
         return self.decode(self.encode(image, wrap), image, queries, wrap)
 
-    @torch.no_grad()
-    def ranges(self, scan: Scan, sensor: Sensor) -> torch.Tensor:
+    def ranges(self, scan: Scan, sensor: Sensor, precision: str = "float32") -> torch.Tensor:
         """Predicts what `sensor` would measure at the place of a scan, as the raw output of the network.
-
-        The memory needed beyond the output does not grow with the number of rays.
 
         Args:
             scan: What was measured.
             sensor: The rays to predict; any tables within the field of view of the scan's sensor.
+            precision: See `Upsampler`.
 
         Returns:
             (H, W) float32 metres on the scan's device; near `norm_range` means no return. Rays outside the field of
             view get the range of the outermost beam next to them.
         """
-        image = scan.filled(self.norm_range).unsqueeze(0)
-        queries = scan.sensor.grid_queries(sensor).to(image.device).view(1, -1, 2)
-        wrap = scan.sensor.wrap
-        features = self.encode(image, wrap)
-        chunks = queries.split(_CHUNK[image.device.type], dim=1)
-        return torch.cat([self.decode(features, image, chunk, wrap) for chunk in chunks], dim=1).view(sensor.shape)
+        return Upsampler(self, scan.sensor, sensor, precision, scan.ranges.device).ranges(scan)
 
-    def upsample(self, scan: Scan, sensor: Sensor) -> Scan:
+    def upsample(self, scan: Scan, sensor: Sensor, precision: str = "float32") -> Scan:
         """Predicts the scan that `sensor` would measure at the place of a scan.
+
+        For many scans of one sensor, keep an `Upsampler`.
 
         Args:
             scan: What was measured.
             sensor: The sensor whose scan is wanted, in the same frame: any resolution, any tables.
+            precision: See `Upsampler`.
 
         Returns:
             A scan of `sensor`. Rays outside the field of view of the scan's sensor, those predicted beyond the maximum
             range of either, and those below the minimum range of `sensor`, hold no return.
         """
-        return returns(self.ranges(scan, sensor), scan.sensor, sensor)
+        return Upsampler(self, scan.sensor, sensor, precision, scan.ranges.device)(scan)
+
+
+class Upsampler:
+    """Makes scans of one sensor from scans of another, frame after frame.
+
+    What frames have in common is prepared once. A frame is encoded once and its queries are decoded in tiles; beyond
+    the output the memory needed does not grow with their number. On CUDA the first frame is recorded as a graph and the
+    following ones replay it, without a word from the host in between.
+
+    Args:
+        model: Whose weights are used as they are at each call; on CUDA they may change, but not move.
+        source: The sensor that measures.
+        target: The sensor whose scans are wanted.
+        precision: "float32", or "bfloat16" for the layers that are faster so; the ranges themselves stay float32.
+        device: Where the scans and the model are.
+
+    Raises:
+        ValueError: If the precision is unknown.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        source: Sensor,
+        target: Sensor,
+        precision: str = "float32",
+        device: torch.device | str = "cpu",
+    ):
+        if precision not in PRECISIONS:
+            raise ValueError(f"precision is {precision!r}; it should be one of {', '.join(PRECISIONS)}")
+        self.model, self.source, self.target = model, source, target
+        self.device = torch.device(device)
+        self._half = precision == "bfloat16"
+        queries = source.grid_queries(target)
+        self._seen = source.contains(queries).to(self.device)
+        self._queries = queries.view(1, -1, 2).to(self.device)
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    @torch.no_grad()
+    def ranges(self, scan: Scan) -> torch.Tensor:
+        """Predicts (H, W) float32 metres, the raw output of the network; see `Model.ranges`.
+
+        Raises:
+            ValueError: If the scan is not one of the source sensor, or on another device.
+        """
+        if scan.sensor != self.source:
+            raise ValueError(f"the scan is of {scan.sensor!r}, but this upsampler was made for {self.source!r}")
+        if scan.ranges.device.type != self.device.type:
+            raise ValueError(f"the scan is on {scan.ranges.device}, but this upsampler was made for {self.device}")
+        image = scan.filled(self.model.norm_range).unsqueeze(0)
+        answer = self._replay(image) if self.device.type == "cuda" else self._answer(image)
+        return answer.view(self.target.shape)
+
+    def __call__(self, scan: Scan) -> Scan:
+        """Predicts the target sensor's scan; see `Model.upsample`."""
+        return _returns(self.ranges(scan), self._seen, self.source, self.target)
+
+    def _answer(self, image: torch.Tensor) -> torch.Tensor:
+        model, wrap = self.model, self.source.wrap
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._half):
+            encoded = model.encode(image, wrap)
+            count = self._queries.shape[1]
+            answer = image.new_empty(1, count)
+            tile = model.tile(encoded) or count
+            for begin in range(0, count, tile):
+                part = slice(begin, begin + tile)
+                answer[:, part] = model.decode(encoded, image, self._queries[:, part], wrap)
+        return answer
+
+    def _replay(self, image: torch.Tensor) -> torch.Tensor:
+        if self._graph is None:
+            self._image = image.clone()
+            # Before the recording, which may neither load kernels nor try out algorithms.
+            aside = torch.cuda.Stream(self.device)
+            aside.wait_stream(torch.cuda.current_stream(self.device))
+            with torch.cuda.stream(aside):
+                self._answer(self._image)
+            torch.cuda.current_stream(self.device).wait_stream(aside)
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph):
+                self._recorded = self._answer(self._image)
+        self._image.copy_(image)
+        self._graph.replay()
+        return self._recorded.clone()
 
 
 def normalised(image: torch.Tensor, norm_range: float) -> torch.Tensor:
@@ -112,6 +203,9 @@ def returns(ranges: torch.Tensor, source: Sensor, sensor: Sensor) -> Scan:
         A scan of `sensor`; 0 outside the field of view of `source` and outside the range limits of `sensor`, and
         beyond the maximum range of `source`, where a blend with no return lies.
     """
-    seen = source.contains(source.grid_queries(sensor)).to(ranges.device)
+    return _returns(ranges, source.contains(source.grid_queries(sensor)).to(ranges.device), source, sensor)
+
+
+def _returns(ranges: torch.Tensor, seen: torch.Tensor, source: Sensor, sensor: Sensor) -> Scan:
     valid = seen & (ranges >= sensor.min_range) & (ranges <= min(sensor.max_range, source.max_range))
     return Scan(ranges.where(valid, 0.0), sensor)

@@ -14,7 +14,8 @@ class Nearest(Model):
     def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Answers queries (B, Q, 2) with ranges (B, Q) [m]."""
         # A query moved onto a pixel centre has that pixel as its only neighbour with an area.
-        return gather_blend(image, queries.round(), queries.new_zeros(*queries.shape[:-1], 4), "bilinear", wrap)
+        scores = queries.new_zeros(*queries.shape[:-1], 4)
+        return gather_blend(image, queries.round(), scores, "bilinear", wrap, backend=self.backend)
 
 
 class Bilinear(Model):
@@ -30,4 +31,5 @@ class Bilinear(Model):
 
     def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Answers queries (B, Q, 2) with ranges (B, Q) [m]."""
-        return gather_blend(image, queries, queries.new_zeros(*queries.shape[:-1], 4), self.prior, wrap)
+        scores = queries.new_zeros(*queries.shape[:-1], 4)
+        return gather_blend(image, queries, scores, self.prior, wrap, backend=self.backend)

@@ -1,17 +1,42 @@
 """The feature extractor of LIIF and ILN: EDSR without its upsampling tail (paper, Sec. II-B)."""
 
+from typing import Any
+
 import torch
 from torch import nn
 
 __all__ = ["Encoder"]
 
 
-def _pad(x: torch.Tensor, wrap: bool) -> torch.Tensor:
-    """Adds one pixel on each side of (B, C, H, W): rows repeat, columns wrap around the seam or repeat."""
-    # Slices rather than F.pad, which leaves the channels_last format.
-    left, right = (x[..., -1:], x[..., :1]) if wrap else (x[..., :1], x[..., -1:])
-    x = torch.cat((left, x, right), -1)
-    return torch.cat((x[..., :1, :], x, x[..., -1:, :]), -2)
+class _Pad(torch.autograd.Function):
+    """Adds one pixel on each side of (B, C, H, W): rows repeat, columns wrap around the seam or repeat.
+
+    By hand, since `F.pad` leaves the channels_last format, and the gradient of slices put together takes as long as the
+    convolution: each slice gets a gradient of the size of the whole.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor, wrap: bool) -> torch.Tensor:
+        ctx.left, ctx.right = (-1, 0) if wrap else (0, -1)
+        batch, channels, height, width = x.shape
+        padded = x.new_empty(batch, height + 2, width + 2, channels).movedim(3, 1)
+        rows = padded[..., 1:-1]
+        rows[..., 1:-1, :] = x
+        rows[..., 0, :], rows[..., -1, :] = x[..., 0, :], x[..., -1, :]
+        padded[..., 0], padded[..., -1] = rows[..., ctx.left].clone(), rows[..., ctx.right].clone()
+        return padded
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None]:
+        rows = gradient[..., 1:-1]
+        x = rows[..., 1:-1, :].clone(memory_format=torch.channels_last)
+        for padding, column in ((gradient[..., 0], ctx.left), (gradient[..., -1], ctx.right)):
+            x[..., column] += padding[..., 1:-1]
+            x[..., 0, column] += padding[..., 0]
+            x[..., -1, column] += padding[..., -1]
+        x[..., 0, :] += rows[..., 0, :]
+        x[..., -1, :] += rows[..., -1, :]
+        return x, None
 
 
 class _Conv(nn.Conv2d):
@@ -21,7 +46,7 @@ class _Conv(nn.Conv2d):
         super().__init__(channels_in, channels_out, 3)
 
     def forward(self, x: torch.Tensor, wrap: bool) -> torch.Tensor:  # type: ignore[override]
-        return super().forward(_pad(x, wrap))
+        return super().forward(_Pad.apply(x, wrap))
 
 
 class _ResidualBlock(nn.Module):

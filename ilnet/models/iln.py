@@ -1,14 +1,33 @@
 """The Implicit LiDAR Network: attention among the neighbours predicts how to weigh their ranges (paper, Sec. II)."""
 
+from typing import NamedTuple
+
 import torch
 from torch import nn
 
 from ilnet.models.base import OFFSET_SCALE, Model, normalised
 from ilnet.models.encoder import Encoder
-from kernels import attend_neighbours, gather_blend, gather_neighbours
+from kernels import (
+    DecoderWeights,
+    Projected,
+    attend_neighbours,
+    fused_decode,
+    fused_decode_serves,
+    gather_blend,
+    gather_neighbours,
+    neighbour_attention,
+    project_pixels,
+)
 from kernels.reference import PRIORS
 
 __all__ = ["ILN"]
+
+
+class _Encoded(NamedTuple):
+    features: torch.Tensor
+    """(B, C, H, W), z of each pixel."""
+    projected: Projected | None
+    """For the first attention; None where it is done token by token."""
 
 
 class _Attention(nn.Module):
@@ -22,8 +41,8 @@ class _Attention(nn.Module):
         self.out = nn.Linear(features, features)
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.dropout(self.out(attend_neighbours(self.qkv(self.norm(x)), self.heads)))
+    def forward(self, x: torch.Tensor, backend: str) -> torch.Tensor:
+        return self.dropout(self.out(attend_neighbours(self.qkv(self.norm(x)), self.heads, backend)))
 
 
 class _FeedForward(nn.Sequential):
@@ -44,8 +63,8 @@ class _Block(nn.Module):
         self.attention = _Attention(features, heads, dropout)
         self.feed_forward = _FeedForward(features, dropout)
 
-    def forward(self, z: torch.Tensor) -> torch.Tensor:
-        z = z + self.attention(z)
+    def forward(self, z: torch.Tensor, backend: str) -> torch.Tensor:
+        z = z + self.attention(z, backend)
         return z + self.feed_forward(z)
 
 
@@ -59,7 +78,7 @@ class ILN(Model):
         features: Channels of the encoder and of the attention.
         blocks: Residual blocks of the encoder.
         heads: Attention heads; they divide `features`.
-        dropout: Rate in the attention blocks while training.
+        dropout: Rate in the attention blocks while training; the authors' is 0.1.
         area_floor: Least bilinear area in the prior, so that a measured pixel can be overruled.
         norm_range: Metres that the encoder sees as +1; no return is filled with it.
 
@@ -76,7 +95,7 @@ class ILN(Model):
         features: int = 64,
         blocks: int = 16,
         heads: int = 8,
-        dropout: float = 0.1,
+        dropout: float = 0.0,
         area_floor: float = 1e-4,
         norm_range: float = 100.0,
     ):
@@ -85,7 +104,7 @@ class ILN(Model):
         if heads < 1 or features % heads:
             raise ValueError(f"heads is {heads}; it should divide the {features} features")
         super().__init__()
-        self.prior, self.area_floor, self.norm_range = prior, area_floor, norm_range
+        self.prior, self.area_floor, self.norm_range, self.dropout = prior, area_floor, norm_range, dropout
         self.encoder = Encoder(features, blocks)
         self.position = nn.Linear(2, features)
         self.blocks = nn.ModuleList(_Block(features, heads, dropout) for _ in range(depth))
@@ -95,15 +114,52 @@ class ILN(Model):
             nn.init.zeros_(score.bias)
         self.head = nn.Sequential(nn.LayerNorm(features), score)
 
-    def encode(self, image: torch.Tensor, wrap: bool) -> torch.Tensor:
-        """Extracts features z (B, C, H, W) from ranges (B, H, W) [m], scaled to [-1, 1]."""
-        return self.encoder(normalised(image, self.norm_range), wrap)
+    def encode(self, image: torch.Tensor, wrap: bool) -> _Encoded:
+        """Extracts features z from ranges (B, H, W) [m], scaled to [-1, 1]; projects them for the first attention."""
+        z = self.encoder(normalised(image, self.norm_range), wrap)
+        if len(self.blocks) == 0 or (self.training and self.dropout > 0):
+            return _Encoded(z, None)
+        first = self._first().attention
+        position = self.position.weight * OFFSET_SCALE, self.position.bias
+        norm = first.norm.weight, first.norm.bias
+        return _Encoded(z, project_pixels(z, position, norm, first.qkv.weight, first.heads))
 
-    def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+    def decode(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Weighs and blends the 4 neighbours of each query."""
-        z, offsets = gather_neighbours(features, queries, wrap)
-        z = z + self.position(offsets * OFFSET_SCALE)
-        for block in self.blocks:
-            z = block(z)
+        features, projected = encoded
+        blocks = self.blocks
+        if projected is None:
+            z, offsets = gather_neighbours(features, queries, wrap, self.backend)
+            z = z + self.position(offsets * OFFSET_SCALE)
+        elif self._is_fused(projected):
+            weights = self._decoder_weights()
+            return fused_decode(projected, image, queries, weights, self.prior, wrap, area_floor=self.area_floor)
+        else:
+            first, blocks = self._first(), self.blocks[1:]
+            output = first.attention.out.weight, first.attention.out.bias
+            z = neighbour_attention(projected, queries, output, wrap, backend=self.backend)
+            z = z + first.feed_forward(z)
+        for block in blocks:
+            z = block(z, self.backend)
         scores = self.head(z).squeeze(-1).to(image.dtype)
-        return gather_blend(image, queries, scores, self.prior, wrap, area_floor=self.area_floor)
+        return gather_blend(image, queries, scores, self.prior, wrap, area_floor=self.area_floor, backend=self.backend)
+
+    def tile(self, encoded: _Encoded) -> int | None:
+        """The fused decoder holds nothing per query."""
+        fused = encoded.projected is not None and self._is_fused(encoded.projected)
+        return None if fused else super().tile(encoded)
+
+    def _is_fused(self, projected: Projected) -> bool:
+        inference = self.backend == "warp" and not torch.is_grad_enabled()
+        return inference and len(self.blocks) == 1 and fused_decode_serves(projected)
+
+    def _first(self) -> _Block:
+        block = self.blocks[0]
+        assert isinstance(block, _Block)
+        return block
+
+    def _decoder_weights(self) -> DecoderWeights:
+        block, (head_norm, score) = self._first(), self.head
+        norm, hidden, _, _, back, _ = block.feed_forward
+        layers = (block.attention.out, norm, hidden, back, head_norm, score)
+        return DecoderWeights(*((layer.get_parameter("weight"), layer.get_parameter("bias")) for layer in layers))

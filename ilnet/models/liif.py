@@ -39,6 +39,6 @@ class LIIF(Model):
 
     def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Predicts and blends the values of the 4 neighbours of each query."""
-        z, offsets = gather_neighbours(features, queries, wrap)
+        z, offsets = gather_neighbours(features, queries, wrap, self.backend)
         values = self.value(torch.cat((z, (offsets * OFFSET_SCALE).to(z.dtype)), -1)).squeeze(-1)
-        return (area_blend(values, queries).float() + 1) * (self.norm_range / 2)
+        return (area_blend(values, queries, self.backend).float() + 1) * (self.norm_range / 2)

@@ -180,7 +180,7 @@ def test_upsample_does_not_depend_on_the_chunk(yard, monkeypatch):
     model = small("bilinear")
     scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
     expected = model.ranges(scan, preset("paper-64x1024"))
-    monkeypatch.setitem(base._CHUNK, "cpu", 777)
+    monkeypatch.setitem(base._TILE, "cpu", 777)
     torch.testing.assert_close(model.ranges(scan, preset("paper-64x1024")), expected, rtol=0, atol=METRES)
 
 
@@ -193,7 +193,7 @@ def test_upsample_decodes_in_pieces_of_bounded_size(yard):
     model.decode = lambda e, i, queries, w: sizes.append(queries.shape[1]) or decode(e, i, queries, w)
     model.ranges(scan, preset("paper-128x2048"))
     assert sum(sizes) == 128 * 2048
-    assert max(sizes) == base._CHUNK["cpu"]
+    assert max(sizes) == base._TILE["cpu"]
 
 
 def test_bilinear_upsampling_is_close_to_the_truth_on_the_ground(yard):

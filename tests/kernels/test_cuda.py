@@ -8,7 +8,16 @@ import warp as wp
 import kernels
 from kernels.launch import initialise
 
-MODULES = ["area_blend", "attention", "gather", "gather_blend", "fused_attention", "neighbour_attention", "neighbours", "raycast"]
+MODULES = [
+    "area_blend",
+    "attention",
+    "gather",
+    "gather_blend",
+    "fused_attention",
+    "neighbour_attention",
+    "neighbours",
+    "raycast",
+]
 
 
 def test_the_list_is_whole():
