@@ -253,7 +253,7 @@ def step_backward(
             (bands + 1 - parity) // 2,
             [
                 *arguments(pixels, queries, slope, shift, gram, heads, eps, wrap),
-                *(weight, adj_step.reshape(-1, channels), scratch[0], order, starts, parity),
+                *(weight, adj_step.reshape(-1, channels).contiguous(), scratch[0], order, starts, parity),
             ],
             [
                 *(scratch[0], scratch[1], scratch[2], scratch[3:].view(-1, 4 * channels)),

@@ -1,7 +1,9 @@
 """The one way a kernel is launched: torch tensors in, on their device, stream and CPU cores."""
 
+import collections
 import contextlib
 import itertools
+import math
 import os
 import tempfile
 import threading
@@ -116,7 +118,8 @@ def overload(kernel: wp.Kernel, half: bool = False) -> dict[torch.dtype, wp.Kern
 
     Args:
         kernel: A kernel with two generic types. `Any` is what its tensors store; `wp.Float` is what it computes with,
-            in other tensors or in scalars: the same, but float32 beside half precision.
+            in other tensors or in scalars: the same, but float32 beside half precision. In vectors of a fixed length
+            `wp.Scalar` stands for `Any`.
         half: Whether bfloat16 and float16 are served besides float32 and float64.
 
     Returns:
@@ -155,11 +158,14 @@ def _dtypes(half: bool) -> list[torch.dtype]:
 
 
 def _concrete(kernel: wp.Kernel, stored: type, computed: type) -> wp.Kernel:
-    known = {Any: stored, wp.Float: computed}
+    known = {Any: stored, wp.Scalar: stored, wp.Float: computed}
 
     def concrete(annotation: Any) -> Any:
-        if (dtype := getattr(annotation, "dtype", None)) in known:
+        dtype: Any = getattr(annotation, "dtype", None)
+        if dtype in known:
             return wp.array(dtype=known[dtype], ndim=annotation.ndim)
+        if (scalar := getattr(dtype, "_wp_scalar_type_", None)) in known:
+            return wp.array(dtype=wp.types.vector(dtype._length_, known[scalar]), ndim=annotation.ndim)
         return known.get(annotation, annotation)
 
     return wp.overload(kernel, [concrete(argument.type) for argument in kernel.adj.args])
@@ -170,16 +176,15 @@ def _to_warp(argument: Any, annotation: Any) -> Any:
         return argument
     dtype = getattr(annotation, "dtype", None)
     if shape := getattr(dtype, "_shape_", ()):
-        argument = argument.unflatten(-1, (-1, *shape))
+        outer, inner = argument.shape[: annotation.ndim - 1], argument.shape[annotation.ndim - 1 :]
+        argument = argument.view(*outer, math.prod(inner) // math.prod(shape), *shape)
         if shape == (1,):  # a dimension of one element may have any stride; one that torch adds has the one Warp wants
             argument = argument.squeeze(-1).unsqueeze(-1)
         return wp.from_torch(argument.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
     return wp.from_torch(argument.detach(), requires_grad=False, return_ctype=True)
 
 
-def launch(
-    kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[torch.Tensor], least: int = _MIN_CHUNK
-) -> None:
+def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[Any], least: int = _MIN_CHUNK) -> None:
     """Runs `threads` threads of a kernel on the device of its outputs and waits for nothing but CPU work.
 
     A kernel's first argument is `first: int`, the number of its first thread: Warp runs a CPU launch on one core,
@@ -190,8 +195,9 @@ def launch(
     Args:
         kernel: A Warp kernel without generic arguments (see `overload`).
         threads: How many threads to run.
-        inputs: The kernel's arguments after `first`: tensors, numbers, Warp handles.
-        outputs: Tensors the kernel writes, all on one device.
+        inputs: The kernel's arguments after `first`: tensors, numbers, Warp handles, None for no array. The vectors of
+            an array of vectors lie one after the other in the last dimensions of the tensor.
+        outputs: Tensors the kernel writes, all on one device; the first is not None.
         least: Fewest threads that are worth a core of their own.
     """
     if threads == 0:
@@ -208,15 +214,32 @@ def launch(
         wp.launch(kernel, threads, inputs=[0, *arguments], stream=stream, record_tape=False)
         return
 
-    def run(bounds: tuple[int, int]) -> None:
-        wp.launch(kernel, bounds[1] - bounds[0], inputs=[bounds[0], *arguments], device="cpu", record_tape=False)
+    def run(begin: int, end: int) -> None:
+        wp.launch(kernel, end - begin, inputs=[begin, *arguments], device="cpu", record_tape=False)
 
     cores = torch.get_num_threads()
     pieces = min(cores * _CHUNKS_PER_CORE, threads // least)
     if cores == 1 or pieces < 2:
-        run((0, threads))
+        run(0, threads)
         return
     with _lock:  # compiled or loaded once, before the cores ask for it together
         kernel.module.load("cpu")
     edges = [threads * i // pieces for i in range(pieces + 1)]
-    list(_pool(cores).map(run, itertools.pairwise(edges)))
+    chunks = collections.deque(itertools.pairwise(edges))
+
+    def work() -> None:
+        while True:
+            try:
+                chunk = chunks.popleft()
+            except IndexError:
+                return
+            run(*chunk)
+
+    # This thread works as well; helpers that have not begun when it is done are not waited for.
+    helpers = [_pool(cores).submit(work) for _ in range(cores - 1)]
+    try:
+        work()
+    finally:
+        for helper in helpers:
+            if not helper.cancel():
+                helper.result()

@@ -130,10 +130,9 @@ def _neighbour_attention(
     attended = torch.empty_like(tokens)
     inputs = fused_attention.arguments(pixels, queries, slope, shift, gram, heads, eps, wrap)
     launch(_attend[pixels.dtype], batch * count * heads, inputs, [tokens, attended])
-    step = torch.addmm(bias, attended.to(dtype), weight.to(dtype).T) if dtype != pixels.dtype else None
-    return ((attended @ weight.T).add_(bias).add_(tokens) if step is None else step + tokens.to(dtype)).view(
-        batch, count, 4, channels
-    )
+    with torch.autocast(pixels.device.type, enabled=False):
+        step = tokens.add_(bias).to(dtype).addmm_(attended.to(dtype), weight.to(dtype).T)
+    return step.view(batch, count, 4, channels)
 
 
 @_neighbour_attention.register_fake
@@ -170,29 +169,34 @@ def _neighbour_attention_backward(
     count, channels = queries.shape[1], len(weight)
     if fused_attention.fits(pixels, adj_step.dtype, channels, heads):
         return fused_attention.step_backward(pixels, queries, slope, shift, gram, weight, adj_step, heads, eps, wrap)  # type: ignore[return-value]
-    adj_tokens = adj_step.reshape(-1, channels).to(pixels.dtype)
-    adj_attended = adj_tokens @ weight
-    adj_rows = pixels.new_zeros(len(adj_tokens), columns)
-    attended = torch.empty_like(adj_tokens)
-    adj_squares = pixels.new_empty(len(adj_tokens), heads)
-    coefficients = pixels.new_empty(len(adj_tokens), 3)
-    launch(
-        _attend_backward[pixels.dtype],
-        batch * count * heads,
-        [*fused_attention.arguments(pixels, queries, slope, shift, gram, heads, eps, wrap), adj_tokens, adj_attended],
-        [adj_rows, attended, adj_squares, coefficients],
-    )
-    adj_squares, offsets = adj_squares.sum(1, keepdim=True), coefficients[:, :2]
-    adj_rows[:, 4 * channels : 4 * channels + 3] = torch.cat((adj_squares, 2 * offsets * adj_squares), 1)
-    adj_affine = coefficients.T @ adj_rows[:, : 4 * channels]
-    return (
-        adjoint_of_gather(adj_rows.view(batch, count, 4, columns), queries, height, width, wrap),
-        adj_affine[:2].clone(),
-        adj_affine[2, : 3 * channels].clone(),
-        offsets.T @ (offsets * adj_squares),
-        adj_tokens.T @ attended,
-        adj_tokens.sum(0),
-    )
+    with torch.autocast(pixels.device.type, enabled=False):
+        adj_tokens = adj_step.reshape(-1, channels).to(pixels.dtype).contiguous()
+        adj_attended = adj_tokens @ weight
+        adj_rows = pixels.new_zeros(len(adj_tokens), columns)
+        attended = torch.empty_like(adj_tokens)
+        adj_squares = pixels.new_empty(len(adj_tokens), heads)
+        coefficients = pixels.new_empty(len(adj_tokens), 3)
+        launch(
+            _attend_backward[pixels.dtype],
+            batch * count * heads,
+            [
+                *fused_attention.arguments(pixels, queries, slope, shift, gram, heads, eps, wrap),
+                adj_tokens,
+                adj_attended,
+            ],
+            [adj_rows, attended, adj_squares, coefficients],
+        )
+        adj_squares, offsets = adj_squares.sum(1, keepdim=True), coefficients[:, :2]
+        adj_rows[:, 4 * channels : 4 * channels + 3] = torch.cat((adj_squares, 2 * offsets * adj_squares), 1)
+        adj_affine = coefficients.T @ adj_rows[:, : 4 * channels]
+        return (
+            adjoint_of_gather(adj_rows.view(batch, count, 4, columns), queries, height, width, wrap),
+            adj_affine[:2].clone(),
+            adj_affine[2, : 3 * channels].clone(),
+            offsets.T @ (offsets * adj_squares),
+            adj_tokens.T @ attended,
+            adj_tokens.sum(0),
+        )
 
 
 @_neighbour_attention_backward.register_fake

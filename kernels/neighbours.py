@@ -16,12 +16,15 @@ from kernels.launch import lanes, launch, overload, overload_vectors
 __all__ = [
     "adjoint_of_gather",
     "area",
+    "bounds",
     "broadcast_batch",
     "channel_spans",
     "check_queries",
     "neighbour",
     "offset",
     "sort_queries",
+    "sum_by_pixel",
+    "sum_by_query",
 ]
 
 
@@ -36,8 +39,30 @@ def base(coordinate: Any):
 def column_of(column: int, width: int, wrap: int):
     """The pixel column that an unbounded column number stands for."""
     if wrap != 0:
+        if column >= 0 and column < width:
+            return column  # the usual case, without a division
         return ((column % width) + width) % width
     return wp.clamp(column, 0, width - 1)
+
+
+@wp.func
+def bounds(row: Any, column: Any, height: int, width: int, wrap: int):
+    """Rows above and below and columns left and right of a query, which its neighbours are made of."""
+    r = wp.floor(row)
+    c = wp.floor(column)
+    zero = type(row)(0.0)
+    if r >= zero and c >= zero and r < type(row)(height - 1) and c < type(row)(width - 1):
+        above = wp.max(int(r), 0)  # it is: so much the compiler must see, or it provides for negative indices
+        left = wp.max(int(c), 0)
+        return above, above + 1, left, left + 1  # the usual case, without a border
+    i = base(row)
+    j = base(column)
+    return (
+        wp.max(wp.min(i, height - 1), 0),
+        wp.max(wp.min(i + 1, height - 1), 0),
+        wp.max(column_of(j, width, wrap), 0),
+        wp.max(column_of(j + 1, width, wrap), 0),
+    )
 
 
 @wp.func
@@ -115,7 +140,7 @@ def _number_cells_kernel(
 ):
     thread = first + wp.tid()
     b = thread // queries.shape[1]
-    q = thread % queries.shape[1]
+    q = thread - b * queries.shape[1]
     cells_out[b, q] = cell(queries[b, q, 0], queries[b, q, 1], height, width, wrap)
 
 
@@ -124,38 +149,100 @@ def _sum_gradients_kernel(
     first: int,
     # in
     gradients: wp.array4d[Any],
-    queries: wp.array3d[wp.Float],
-    order: wp.array2d[wp.int32],
-    starts: wp.array2d[wp.int32],
-    span: int,
+    order: wp.array[wp.int32],
+    starts: wp.array[wp.int32],
     wrap: int,
     # out
     pixels_out: wp.array4d[Any],
 ):
     height = pixels_out.shape[1]
     width = pixels_out.shape[2]
-    spans = (pixels_out.shape[3] + span - 1) // span
     thread = first + wp.tid()
-    begin = (thread % spans) * span
-    end = wp.min(begin + span, pixels_out.shape[3])
-    pixel = thread // spans
+    c = thread % pixels_out.shape[3]
+    pixel = thread // pixels_out.shape[3]
     b = pixel // (height * width)
     i = (pixel // width) % height
     j = pixel % width
+    total = pixels_out[b, i, j, c]
     for k in range(4):
         n = cell_index(i, j, k, height, width, wrap)
         if n >= 0:
-            for s in range(starts[b, n], starts[b, n + 1]):
-                q = order[b, s]
-                for t in range(4):
-                    r, col = neighbour(queries[b, q, 0], queries[b, q, 1], t, height, width, wrap)
-                    if r == i and col == j:
-                        for c in range(begin, end):
-                            pixels_out[b, i, j, c] = pixels_out[b, i, j, c] + gradients[b, q, t, c]
+            above = n // (width + 1) - 1
+            left = n % (width + 1) - 1
+            n = n + b * (height + 1) * (width + 1)
+            for t in range(4):
+                row = wp.clamp(above + t // 2, 0, height - 1)
+                if row == i and column_of(left + t % 2, width, wrap) == j:
+                    for s in range(starts[n], starts[n + 1]):
+                        total = total + gradients[b, order[s] - b * gradients.shape[1], t, c]
+    pixels_out[b, i, j, c] = total
+
+
+@wp.kernel(enable_backward=False)
+def _add_gradients_kernel(
+    first: int,
+    # in
+    gradients: wp.array4d[Any],
+    queries: wp.array3d[wp.Float],
+    zero: wp.Float,
+    height: int,
+    width: int,
+    span: int,
+    wrap: int,
+    # out
+    slices_out: wp.array3d[Any],
+):
+    spans = (gradients.shape[3] + span - 1) // span
+    thread = first + wp.tid()
+    begin = (thread % spans) * span
+    end = wp.min(begin + span, gradients.shape[3])
+    part = thread // spans
+    slices = slices_out.shape[0] // queries.shape[0]
+    b = part // slices
+    per_slice = (queries.shape[1] + slices - 1) // slices
+    start = (part % slices) * per_slice
+    for p in range(slices_out.shape[1]):
+        for c in range(begin, end):
+            slices_out[part, p, c] = gradients.dtype(zero)
+    for q in range(start, wp.min(start + per_slice, queries.shape[1])):
+        above, below, left, right = bounds(queries[b, q, 0], queries[b, q, 1], height, width, wrap)
+        p0 = above * width + left
+        p1 = above * width + right
+        p2 = below * width + left
+        p3 = below * width + right
+        for c in range(begin, end):
+            slices_out[part, p0, c] = slices_out[part, p0, c] + gradients[b, q, 0, c]
+            slices_out[part, p1, c] = slices_out[part, p1, c] + gradients[b, q, 1, c]
+            slices_out[part, p2, c] = slices_out[part, p2, c] + gradients[b, q, 2, c]
+            slices_out[part, p3, c] = slices_out[part, p3, c] + gradients[b, q, 3, c]
+
+
+@wp.kernel(enable_backward=False)
+def _sum_slices_kernel(
+    first: int,
+    # in
+    slices: wp.array4d[Any],
+    zero: wp.Float,
+    # out
+    sums_out: wp.array3d[Any],
+):
+    thread = first + wp.tid()
+    c = thread % slices.shape[3]
+    p = (thread // slices.shape[3]) % slices.shape[2]
+    b = thread // slices.shape[3] // slices.shape[2]
+    total = slices.dtype(zero)
+    for s in range(slices.shape[1]):
+        total = total + slices[b, s, p, c]
+    sums_out[b, p, c] = total
 
 
 _number_cells = overload(_number_cells_kernel)
 _sum_gradients = overload_vectors(_sum_gradients_kernel)
+_add_gradients = overload_vectors(_add_gradients_kernel)
+_sum_slices = overload_vectors(_sum_slices_kernel)
+
+# Threads of the sum on a CPU. A constant: the number of cores does not change the rounding.
+_PARTS = 8
 
 
 def sort_queries(queries: torch.Tensor, height: int, width: int, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
@@ -185,10 +272,9 @@ def sort_queries(queries: torch.Tensor, height: int, width: int, wrap: bool) -> 
 def adjoint_of_gather(
     gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool
 ) -> torch.Tensor:
-    """Sums what the queries say of their neighbours into the pixels: the adjoint of gathering, as a gather.
+    """Sums what the queries say of their neighbours into the pixels: the adjoint of gathering.
 
-    Each pixel reads the queries of the cells around it, in a fixed order. A scatter would need atomics: not
-    deterministic on a GPU, and not safe on several CPU cores.
+    Deterministic, and without atomics: those are not deterministic on a GPU and not safe on several CPU cores.
 
     Args:
         gradients: (B, Q, 4, C) float32 or float64, for each query and neighbour.
@@ -200,21 +286,40 @@ def adjoint_of_gather(
     Returns:
         (B, H, W, C).
     """
-    batch, count, _, channels = gradients.shape
-    cells = torch.empty(batch, count, dtype=torch.int32, device=queries.device)
-    launch(_number_cells[queries.dtype], batch * count, [queries, height, width, int(wrap)], [cells])
-    cells, order = torch.sort(cells, dim=1, stable=True)
-    numbers = torch.arange((height + 1) * (width + 1) + 1, dtype=torch.int32, device=queries.device)
-    starts = torch.searchsorted(cells, numbers.expand(batch, -1).contiguous(), out_int32=True)
-    pixels = gradients.new_zeros(batch, height, width, channels)
+    gather = queries.device.type == "cuda"
+    return (sum_by_pixel if gather else sum_by_query)(gradients, queries, height, width, wrap)
+
+
+def sum_by_pixel(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
+    """`adjoint_of_gather` for many small cores: each pixel reads the queries of the cells around it, in their order."""
+    order, starts = sort_queries(queries, height, width, wrap)
+    pixels = gradients.new_zeros(len(gradients), height, width, gradients.shape[3])
+    lane = lanes(gradients.shape[3])
+    inputs = [gradients, order, starts, int(wrap)]
+    launch(_sum_gradients[gradients.dtype, lane], pixels.numel() // lane, inputs, [pixels])
+    return pixels
+
+
+def sum_by_query(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
+    """`adjoint_of_gather` for few big cores: each adds a share of queries and channels to pixels of its own."""
+    batch, _, _, channels = gradients.shape
     lane = lanes(channels)
-    span, spans = channel_spans(channels // lane, gradients.device)
+    blocks = channels // lane
+    spans = min(blocks, -(-_PARTS // batch))
+    slices = -(-_PARTS // (batch * spans))
+    shares = gradients.new_empty(batch * slices, height * width, channels)
+    span = -(-blocks // spans)
     launch(
-        _sum_gradients[gradients.dtype, lane],
-        batch * height * width * spans,
-        [gradients, queries, order.to(torch.int32), starts, span, int(wrap)],
-        [pixels],
+        _add_gradients[gradients.dtype, lane],
+        batch * slices * -(-blocks // span),
+        [gradients, queries, 0.0, height, width, span, int(wrap)],
+        [shares],
+        least=1,
     )
+    # Not `sum`: torch's threads, once woken, spin for milliseconds on cores that the next launch wants.
+    pixels = gradients.new_empty(batch, height, width, channels)
+    inputs = [shares.view(batch, slices, height * width, channels), 0.0]
+    launch(_sum_slices[gradients.dtype, lane], pixels.numel() // lane, inputs, [pixels.flatten(1, 2)])
     return pixels
 
 

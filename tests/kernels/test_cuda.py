@@ -11,9 +11,10 @@ from kernels.launch import initialise
 MODULES = [
     "area_blend",
     "attention",
+    "fused_attention",
+    "fused_decoder",
     "gather",
     "gather_blend",
-    "fused_attention",
     "neighbour_attention",
     "neighbours",
     "raycast",

@@ -3,6 +3,7 @@ import torch
 
 from kernels import gather_neighbours
 from kernels.gather import _gather_neighbours
+from kernels.neighbours import sum_by_pixel, sum_by_query
 
 # A gradient sums a few thousand float32 products at most.
 SUM = 1e-4
@@ -47,6 +48,16 @@ def test_half_precision_is_copied_and_its_gradient_summed_in_float32(dtype, devi
     (gradient,) = torch.autograd.grad(gathered.sum(), half)
     ones = torch.autograd.grad(gather_neighbours(features.requires_grad_(), queries)[0].sum(), features)[0]
     assert torch.equal(gradient, ones.to(dtype))
+
+
+@pytest.mark.parametrize(("height", "width", "wrap"), SIZES)
+@pytest.mark.parametrize(("channels", "batch"), [(1, 1), (9, 2), (32, 16)])
+def test_the_sums_for_a_gpu_and_for_a_cpu_agree(height, width, wrap, channels, batch, device, poisoned):
+    _, queries = draw(height, width, device)
+    queries = queries[:1].expand(batch, -1, -1).contiguous()
+    gradients = torch.randn(batch, 257, 4, channels, generator=torch.Generator().manual_seed(0)).to(device)
+    by_pixel, by_query = (summed(gradients, queries, height, width, wrap) for summed in (sum_by_pixel, sum_by_query))
+    torch.testing.assert_close(by_pixel, by_query, rtol=SUM, atol=SUM)
 
 
 def test_order_of_the_neighbours_and_sign_of_the_offsets(device):
