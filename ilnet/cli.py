@@ -75,6 +75,17 @@ def train(model: str, preset: str, steps: int | None, seed: int, out: Path) -> N
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
 
 
+@cli.command()
+@click.argument("sections", nargs=-1, type=click.Choice(["ops", "frame", "train", "rays"]))
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON list instead of the table.")
+def bench(sections: tuple[str, ...], as_json: bool) -> None:
+    """Time our ops, frames, training steps and rays beside what one would otherwise write; all unless told."""
+    from ilnet import bench as benchmarks
+
+    rows = benchmarks.bench(sections)
+    click.echo(json.dumps([row.json() for row in rows], indent=1) if as_json else benchmarks.table(rows))
+
+
 def _table(methods: dict[str, dict[str, Any]]) -> str:
     columns = {"mae": "MAE [m]", "iou": "IoU", "precision": "precision", "recall": "recall", "f1": "F1"}
     lines = [f"{'method':18}" + "".join(f"{title:>11}" for title in columns.values())]
