@@ -22,9 +22,17 @@ __all__ = [
     "check_queries",
     "neighbour",
     "offset",
+    "query_of",
     "sum_by_pixel",
     "sum_by_query",
 ]
+
+
+@wp.func
+def query_of(thread: int, count: int):
+    """Which image and which of its `count` queries a thread serves; the CPU compiler sees that neither is negative."""
+    b = wp.max(thread // count, 0)
+    return b, wp.max(thread - b * count, 0)
 
 
 @wp.func
@@ -137,9 +145,7 @@ def _number_cells_kernel(
     # out
     cells_out: wp.array2d[wp.int32],
 ):
-    thread = first + wp.tid()
-    b = thread // queries.shape[1]
-    q = thread - b * queries.shape[1]
+    b, q = query_of(first + wp.tid(), queries.shape[1])
     cells_out[b, q] = cell(queries[b, q, 0], queries[b, q, 1], height, width, wrap)
 
 
