@@ -23,6 +23,7 @@ from kernels import reference
 from kernels.launch import check_backend, check_floating, launch, overload
 from kernels.neighbours import adjoint_of_gather, area, bounds, broadcast_batch, check_queries, query_of
 from kernels.reference import PRIORS, RANGE_FLOOR
+from kernels.vmap import fold_into_batch
 
 __all__ = ["gather_blend"]
 
@@ -273,6 +274,8 @@ def _backward(
 
 
 _gather_blend.register_autograd(_backward, setup_context=_setup_context)
+fold_into_batch(_gather_blend)
+fold_into_batch(_gather_blend_backward)
 
 
 @overload_types

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from kernels.launch import lanes, launch, overload, overload_vectors
+from kernels.vmap import fold_into_batch
 
 __all__ = [
     "adjoint_of_gather",
@@ -267,8 +268,10 @@ def adjoint_of_gather(
     Returns:
         (B, H, W, C).
     """
-    gather = queries.device.type == "cuda"
-    return (sum_by_pixel if gather else sum_by_query)(gradients, queries, height, width, wrap)
+    if gradients.numel() == 0:
+        return gradients.new_zeros(gradients.shape[0], height, width, gradients.shape[3])
+    summed = sum_by_pixel if queries.device.type == "cuda" else sum_by_query
+    return summed(gradients.contiguous(), queries, height, width, wrap)
 
 
 def sum_by_pixel(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
@@ -316,6 +319,9 @@ def sum_by_query(gradients: torch.Tensor, queries: torch.Tensor, height: int, wi
 @adjoint_of_gather.register_fake
 def _(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
     return gradients.new_empty(gradients.shape[0], height, width, gradients.shape[3])
+
+
+fold_into_batch(adjoint_of_gather)
 
 
 def channel_spans(blocks: int, device: torch.device) -> tuple[int, int]:
