@@ -14,6 +14,7 @@ import warp as wp
 from kernels import reference
 from kernels.launch import check_backend, check_floating, launch, overload
 from kernels.neighbours import area, broadcast_batch, check_queries
+from kernels.vmap import fold_into_batch
 
 __all__ = ["area_blend"]
 
@@ -90,6 +91,8 @@ def _backward(ctx: Any, adj_blended: torch.Tensor) -> tuple[torch.Tensor, None]:
 
 
 _area_blend.register_autograd(_backward, setup_context=_setup_context)
+fold_into_batch(_area_blend)
+fold_into_batch(_area_blend_backward)
 
 
 def area_blend(values: torch.Tensor, queries: torch.Tensor, backend: str = "warp") -> torch.Tensor:

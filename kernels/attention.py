@@ -16,6 +16,7 @@ import warp as wp
 
 from kernels import reference
 from kernels.launch import check_backend, check_floating, launch, overload
+from kernels.vmap import fold_into_batch
 
 __all__ = ["adj_logits", "attend_neighbours", "softmax_rows"]
 
@@ -154,6 +155,8 @@ def _backward(ctx: Any, adj_attended: torch.Tensor) -> torch.Tensor:
 
 
 _attend_neighbours_op.register_autograd(_backward, setup_context=_setup_context)
+fold_into_batch(_attend_neighbours_op)
+fold_into_batch(_attend_neighbours_backward_op)
 
 
 def attend_neighbours(qkv: torch.Tensor, heads: int, backend: str = "warp") -> torch.Tensor:

@@ -24,6 +24,7 @@ from kernels.launch import check_backend, launch
 from kernels.neighbour_attention import Projected, head_last
 from kernels.neighbours import area, check_queries
 from kernels.reference import PRIORS, RANGE_FLOOR
+from kernels.vmap import refuse
 
 __all__ = ["DecoderWeights", "fused_decode", "fused_decode_serves"]
 
@@ -222,6 +223,9 @@ def _(
     wrap: bool,
 ) -> torch.Tensor:
     return pixels.new_empty(queries.shape[0], queries.shape[1])
+
+
+refuse(_fused_decode, "its image and queries have a batch dimension for that")
 
 
 def fused_decode(

@@ -8,6 +8,7 @@ import warp as wp
 from kernels import reference
 from kernels.launch import check_backend, check_floating, lanes, launch, overload_vectors
 from kernels.neighbours import adjoint_of_gather, broadcast_batch, channel_spans, check_queries, neighbour, offset
+from kernels.vmap import fold_into_batch
 
 __all__ = ["gather_neighbours"]
 
@@ -81,6 +82,7 @@ def _backward(ctx: Any, gradient: torch.Tensor, _: torch.Tensor) -> tuple[torch.
 
 
 _gather_neighbours.register_autograd(_backward, setup_context=_setup_context)
+fold_into_batch(_gather_neighbours)
 
 
 def gather_neighbours(

@@ -21,8 +21,9 @@ import warp as wp
 
 from kernels import reference
 from kernels.launch import check_backend, check_floating, launch, overload
-from kernels.neighbours import adjoint_of_gather, area, bounds, broadcast_batch, check_queries
+from kernels.neighbours import adjoint_of_gather, area, bounds, broadcast_batch, check_queries, query_of
 from kernels.reference import PRIORS, RANGE_FLOOR
+from kernels.vmap import fold_into_batch
 
 __all__ = ["gather_blend"]
 
@@ -100,9 +101,7 @@ def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
         blended_out: wp.array2d[one],
         weights_out: wp.array2d[four],
     ):
-        thread = first + wp.tid()
-        b = thread // queries.shape[1]
-        q = thread - b * queries.shape[1]
+        b, q = query_of(first + wp.tid(), queries.shape[1])
         at = queries[b, q]
         s = scores[b, q]
         r = ranges(image, b, at, weights_out.dtype(), wrap)
@@ -152,9 +151,7 @@ def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
         adj_scores_out: wp.array2d[four_stored],
         adj_ranges_out: wp.array2d[four],
     ):
-        thread = first + wp.tid()
-        b = thread // weights.shape[1]
-        q = thread - b * weights.shape[1]
+        b, q = query_of(first + wp.tid(), weights.shape[1])
         w = weights[b, q]
         r = ranges(image, b, queries[b, q], weights.dtype(), wrap)
         g = adj_blended[b, q]
@@ -277,6 +274,8 @@ def _backward(
 
 
 _gather_blend.register_autograd(_backward, setup_context=_setup_context)
+fold_into_batch(_gather_blend)
+fold_into_batch(_gather_blend_backward)
 
 
 @overload_types
@@ -324,10 +323,12 @@ def gather_blend(
 
     Args:
         image: (..., H, W) float32 or float64 ranges in metres, no return already filled. Other units serve as well,
-            but the perspective prior wants positive ranges and takes those below 0.1 as 0.1.
+            but the perspective prior wants positive ranges and takes those below 0.1 as 0.1. Half precision is
+            refused: bfloat16 rounds 80 m by 0.25 m.
         queries: (..., Q, 2) pixel coordinates (row, column); integers are pixel centres.
-        scores: (..., Q, 4), one per neighbour in the order (row-, col-), (row-, col+), (row+, col-), (row+, col+).
-            The leading dimensions of the three broadcast. Four scores of -inf give NaN.
+        scores: (..., Q, 4), one per neighbour in the order (row-, col-), (row-, col+), (row+, col-), (row+, col+), of
+            the image's dtype; beside a float32 image also bfloat16 or float16, computed with in float32. The leading
+            dimensions of the three broadcast. Four scores of -inf give NaN.
         prior: What zero scores mean: "none" the mean of the neighbours (the paper), "bilinear" bilinear interpolation,
             "perspective" bilinear interpolation of inverse range, which keeps planes flat.
         wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
@@ -336,11 +337,11 @@ def gather_blend(
         backend: "warp", or "torch" for the plain twin in `kernels.reference`.
 
     Returns:
-        blended: (..., Q) metres, within the range of the 4 neighbours.
-        weights: (..., Q, 4), positive, summing to 1; with `return_weights` only.
+        blended: (..., Q) metres, within the range of the 4 neighbours; of the image's dtype.
+        weights: (..., Q, 4), positive, summing to 1, of the scores' dtype; with `return_weights` only.
 
     Raises:
-        TypeError: If an argument is not a tensor of a supported dtype, or image and scores differ in dtype.
+        TypeError: If an argument is not a tensor of a supported dtype.
         ValueError: If a shape, device, prior, floor or backend does not fit.
 
     Source: paper Eq. 3 (`prior="none"`); the priors are ours.
@@ -355,8 +356,11 @@ def gather_blend(
     if image.ndim < 2 or 0 in image.shape[-2:]:
         raise ValueError(f"image has shape {tuple(image.shape)}; it should be (..., H, W), neither of them 0")
     check_queries(queries, image, "image")
-    if scores.dtype != image.dtype:
-        raise TypeError(f"scores is {scores.dtype}, image {image.dtype}; they should have one dtype")
+    if image.dtype != torch.promote_types(scores.dtype, torch.float32):
+        raise TypeError(
+            f"scores is {scores.dtype}, image {image.dtype}; they should have one dtype, or scores half precision"
+            " beside an image in float32"
+        )
     if scores.device != image.device:
         raise ValueError(f"scores is on {scores.device}, image on {image.device}; they should be on one device")
     if scores.ndim < 2 or scores.shape[-2:] != (queries.shape[-2], 4):
@@ -368,5 +372,5 @@ def gather_blend(
     else:
         queries, scores = queries.contiguous(), scores.contiguous()
         blended, weights = _gather_blend(image, queries, scores, PRIORS.index(prior), area_floor, wrap)
-    blended, weights = blended.reshape(*batch, *blended.shape[1:]), weights.reshape(*batch, *weights.shape[1:])
-    return (blended, weights) if return_weights else blended
+    blended = blended.reshape(*batch, *blended.shape[1:])
+    return (blended, weights.reshape(*batch, *weights.shape[1:]).to(scores.dtype)) if return_weights else blended

@@ -16,6 +16,7 @@ from kernels.hoisted import MOMENTS, adj_squares, attend, attend_backward, stenc
 from kernels.lanes import vectors
 from kernels.launch import check_backend, check_floating, launch
 from kernels.neighbours import adjoint_of_gather, check_queries
+from kernels.vmap import refuse
 
 __all__ = ["Projected", "neighbour_attention", "project_pixels"]
 
@@ -227,6 +228,8 @@ def _backward(ctx: Any, adj_step: torch.Tensor) -> tuple[torch.Tensor | None, ..
 
 
 _neighbour_attention.register_autograd(_backward, setup_context=_setup_context)
+refuse(_neighbour_attention, "its features and queries have a batch dimension for that")
+refuse(_neighbour_attention_backward, "ask for one gradient at a time")
 
 
 class Projected(NamedTuple):

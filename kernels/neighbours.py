@@ -12,6 +12,7 @@ import torch
 import warp as wp
 
 from kernels.launch import lanes, launch, overload, overload_vectors
+from kernels.vmap import fold_into_batch
 
 __all__ = [
     "adjoint_of_gather",
@@ -22,10 +23,18 @@ __all__ = [
     "check_queries",
     "neighbour",
     "offset",
+    "query_of",
     "sort_queries",
     "sum_by_pixel",
     "sum_by_query",
 ]
+
+
+@wp.func
+def query_of(thread: int, count: int):
+    """Which image and which of its `count` queries a thread serves; the CPU compiler sees that neither is negative."""
+    b = wp.max(thread // count, 0)
+    return b, wp.max(thread - b * count, 0)
 
 
 @wp.func
@@ -138,9 +147,7 @@ def _number_cells_kernel(
     # out
     cells_out: wp.array2d[wp.int32],
 ):
-    thread = first + wp.tid()
-    b = thread // queries.shape[1]
-    q = thread - b * queries.shape[1]
+    b, q = query_of(first + wp.tid(), queries.shape[1])
     cells_out[b, q] = cell(queries[b, q, 0], queries[b, q, 1], height, width, wrap)
 
 
@@ -286,8 +293,10 @@ def adjoint_of_gather(
     Returns:
         (B, H, W, C).
     """
-    gather = queries.device.type == "cuda"
-    return (sum_by_pixel if gather else sum_by_query)(gradients, queries, height, width, wrap)
+    if gradients.numel() == 0:
+        return gradients.new_zeros(gradients.shape[0], height, width, gradients.shape[3])
+    summed = sum_by_pixel if queries.device.type == "cuda" else sum_by_query
+    return summed(gradients.contiguous(), queries, height, width, wrap)
 
 
 def sum_by_pixel(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
@@ -326,6 +335,9 @@ def sum_by_query(gradients: torch.Tensor, queries: torch.Tensor, height: int, wi
 @adjoint_of_gather.register_fake
 def _(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
     return gradients.new_empty(gradients.shape[0], height, width, gradients.shape[3])
+
+
+fold_into_batch(adjoint_of_gather)
 
 
 def channel_spans(blocks: int, device: torch.device) -> tuple[int, int]:

@@ -87,7 +87,7 @@ def gather_blend(
     """`kernels.gather_blend` on image (B, H, W), queries (B, Q, 2) and scores (B, Q, 4), with the weights."""
     gathered, _ = gather_neighbours(image.unsqueeze(1), queries, wrap)
     ranges = gathered.squeeze(-1)
-    logits = scores
+    logits = scores.to(ranges.dtype)
     if prior != "none":
         logits = logits + areas(queries).clamp(min=area_floor).log()
     if prior == "perspective":

@@ -11,6 +11,8 @@ from kernels.reference import PRIORS, RANGE_FLOOR
 METRES = 5e-5
 # Weights and gradients to scores are sums of a few float32 products.
 RELATIVE = 1e-4
+# A weight or a gradient to a score, rounded once or, by PyTorch's casts, twice.
+HALF = {torch.bfloat16: 2**-7, torch.float16: 2**-10}
 
 SIZES = [(16, 64, True), (5, 7, False), (1, 3, True), (3, 1, True), (1, 1, True), (2, 1, False), (3, 2, True)]
 
@@ -49,6 +51,28 @@ def test_matches_the_reference_with_gradients(height, width, wrap, prior, area_f
 
 
 @pytest.mark.parametrize("prior", PRIORS)
+@pytest.mark.parametrize("dtype", HALF)
+def test_half_precision_scores_leave_the_ranges_in_float32(dtype, prior, device, poisoned):
+    image, queries, scores = draw(8, 16, device)
+    half = scores.to(dtype).requires_grad_()
+    image.requires_grad_()
+    results = []
+    for leaf, backend in ((half, "warp"), (half, "torch"), (half.detach().float().requires_grad_(), "warp")):
+        blended, weights = gather_blend(
+            image, queries, leaf, prior, area_floor=1e-3, return_weights=True, backend=backend
+        )
+        assert blended.dtype == torch.float32
+        assert weights.dtype == leaf.dtype
+        loss = (blended * queries[..., 0].cos()).sum() + (weights.float() * scores).sum()
+        results.append((blended, weights, *torch.autograd.grad(loss, [image, leaf])))
+    for backend in (0, 1):
+        for ours, exact in zip(results[backend], results[2], strict=True):
+            # The ranges and their gradient are not rounded to half precision on their way; weights and scores once.
+            tolerance = RELATIVE if ours.dtype == torch.float32 else HALF[dtype]
+            torch.testing.assert_close(ours.float(), exact.float(), rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("prior", PRIORS)
 @pytest.mark.parametrize("wrap", [True, False])
 def test_gradcheck(prior, wrap, device):
     image, queries, scores = draw(3, 4, device, torch.float64, batch=(1,), count=9)
@@ -59,9 +83,11 @@ def test_gradcheck(prior, wrap, device):
     assert torch.autograd.gradcheck(op, (image.requires_grad_(), scores.requires_grad_()))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize("prior", range(len(PRIORS)))
-def test_opcheck(prior, device):
+def test_opcheck(prior, dtype, device):
     image, queries, scores = draw(4, 5, device, count=11)
+    scores = scores.to(dtype)
     torch.library.opcheck(_gather_blend, (image.requires_grad_(), queries, scores.requires_grad_(), prior, 1e-3, True))
 
 
@@ -213,6 +239,8 @@ def bad_arguments():
         "area_floor is 0.5": (image, queries, scores, {"area_floor": 0.5}),
         "image is torch.int64": (image.long(), queries, scores, {}),
         "image is list": ([[1.0]], queries, scores, {}),
+        "image is torch.bfloat16": (image.bfloat16(), queries, scores.bfloat16(), {}),
+        "scores is torch.float16, image torch.float64": (image.double(), queries, scores.half(), {}),
         r"image has shape \(0, 5\)": (image[:0], queries, scores, {}),
         r"queries has shape \(7, 3\)": (image, torch.ones(7, 3), scores, {}),
         "queries is torch.int64": (image, queries.long(), scores, {}),
