@@ -38,6 +38,8 @@ BLENDS, TOKENS = 262_144, 65_536
 TRAIN_SCANS, TRAIN_QUERIES = 4, 16_384
 CHUNK = 2048
 
+ROUNDS = 3
+
 
 @dataclass
 class Row:
@@ -68,19 +70,20 @@ class Row:
 Work = Callable[[], list[torch.Tensor]]
 
 
-def _compare(name: str, size: str, ours: Work, others: dict[str, Work], repeat: int = 7) -> Iterator[Row]:
-    """Times `ours` and each of the others in turns; one row for each other."""
+def _compare(name: str, size: str, ours: Work, others: dict[str, Work], repeat: int = 1) -> Iterator[Row]:
+    """Times `ours` and each of the others in turns, `repeat` calls in each of the rounds; one row for each other."""
     for words, other in others.items():
         results = [torch.cat([part.detach().float().flatten() for part in work()]) for work in (ours, other)]
         times: tuple[list[float], list[float]] = ([], [])
-        for _ in range(repeat):
+        for _ in range(ROUNDS):
             for work, seconds in zip((ours, other), times, strict=True):
-                gc.collect()
-                _wait()
-                start = time.perf_counter()
-                work()
-                _wait()
-                seconds.append(time.perf_counter() - start)
+                time.sleep(0.1)  # torch's threads stay awake for a while, on cores that the next one wants
+                for _ in range(repeat):
+                    _wait()
+                    start = time.perf_counter()
+                    work()
+                    _wait()
+                    seconds.append(time.perf_counter() - start)
         a, b = (statistics.median(seconds) for seconds in times)
         difference = (results[0] - results[1]).abs()
         yield Row(name, size, a, words, b, b / a, float(difference.max()), mean_abs_diff=float(difference.mean()))
@@ -178,7 +181,7 @@ def _both(
         compiled = _compiled(plain, device)
         if compiled is not None and words == "eager torch":
             others["torch.compile"] = wrap(compiled)
-        yield from _compare(name + suffix, size, wrap(ours), others)
+        yield from _compare(name + suffix, size, wrap(ours), others, repeat=7)
 
 
 def _grid_sample(image: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
@@ -268,7 +271,7 @@ def frame() -> Iterator[Row]:
                 words: _no_gradients(partial(_plain_frame, model, image, queries, chunk))
                 for words, chunk in chunks.items()
             }
-            for row in _compare(f"frame-{precision}", size, ours, plain, repeat=5 if whole else 3):
+            for row in _compare(f"frame-{precision}", size, ours, plain):
                 row.peak_mb = peak
                 yield row
 
@@ -308,7 +311,6 @@ def train() -> Iterator[Row]:
         f"{TRAIN_SCANS} scans x {TRAIN_QUERIES} queries",
         partial(step, ours),
         {"the authors' formulation, eager, float32": partial(step, plain)},
-        repeat=3,
     )
 
 
