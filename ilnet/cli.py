@@ -1,6 +1,7 @@
 """The command line: `python -m ilnet COMMAND`."""
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -95,6 +96,8 @@ def _table(methods: dict[str, dict[str, Any]]) -> str:
 
 def main() -> None:
     """Runs the command line; what a user can mend is one line on stderr and exit code 2."""
+    # Torch's threads would stay awake for milliseconds after each operation, on cores that the next kernel wants.
+    os.environ.setdefault("GOMP_SPINCOUNT", "3000")
     try:
         sys.exit(cli.main(prog_name="python -m ilnet", standalone_mode=False))
     except click.ClickException as error:

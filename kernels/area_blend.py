@@ -13,54 +13,69 @@ import warp as wp
 
 from kernels import reference
 from kernels.launch import check_backend, check_floating, launch, overload
-from kernels.neighbours import area, broadcast_batch, check_queries
+from kernels.neighbours import BLOCKS, area, broadcast_batch, check_queries, query_blocks
 from kernels.vmap import fold_into_batch
 
 __all__ = ["area_blend"]
 
 
-@wp.kernel(enable_backward=False)
-def _area_blend_kernel(
-    first: int,
-    # in
-    values: wp.array2d[Any],
-    queries: wp.array2d[wp.Float],
-    # out
-    blended_out: wp.array[Any],
-):
-    q = first + wp.tid()
-    row = queries[q, 0]
-    column = queries[q, 1]
-    blended = type(row)(0.0)
-    for t in range(4):
-        blended = blended + area(row, column, t) * type(row)(values[q, t])
-    blended_out[q] = values.dtype(blended)
+def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
+    """The forward and the backward kernel whose threads take n queries each."""
+    two = wp.types.vector(2 * n, wp.Float)
+    one_stored, four_stored = (wp.types.vector(n * numbers, wp.Scalar) for numbers in (1, 4))
+
+    @wp.kernel(enable_backward=False)
+    def _area_blend_kernel(
+        first: int,
+        # in
+        values: wp.array[four_stored],
+        queries: wp.array[two],
+        # out
+        blended_out: wp.array[one_stored],
+    ):
+        q = first + wp.tid()
+        at = queries[q]
+        v = values[q]
+        blended = blended_out.dtype()
+        for k in range(n):
+            total = area(at[2 * k], at[2 * k + 1], 0) * queries.dtype.dtype(v[4 * k])
+            for t in range(1, 4):
+                total = total + area(at[2 * k], at[2 * k + 1], t) * queries.dtype.dtype(v[4 * k + t])
+            blended[k] = blended.dtype(total)
+        blended_out[q] = blended
+
+    @wp.kernel(enable_backward=False)
+    def _area_blend_backward_kernel(
+        first: int,
+        # in
+        adj_blended: wp.array[one_stored],
+        queries: wp.array[two],
+        # out
+        adj_values_out: wp.array[four_stored],
+    ):
+        q = first + wp.tid()
+        at = queries[q]
+        g = adj_blended[q]
+        x = adj_values_out.dtype()
+        for k in range(4 * n):
+            weight = area(at[k // 4 * 2], at[k // 4 * 2 + 1], k % 4)
+            x[k] = x.dtype(weight * queries.dtype.dtype(g[k // 4]))
+        adj_values_out[q] = x
+
+    return _area_blend_kernel, _area_blend_backward_kernel
 
 
-@wp.kernel(enable_backward=False)
-def _area_blend_backward_kernel(
-    first: int,
-    # in
-    adj_blended: wp.array[Any],
-    queries: wp.array2d[wp.Float],
-    # out
-    adj_values_out: wp.array2d[Any],
-):
-    q = first + wp.tid()
-    row = queries[q, 0]
-    column = queries[q, 1]
-    for t in range(4):
-        adj_values_out[q, t] = adj_values_out.dtype(area(row, column, t) * type(row)(adj_blended[q]))
-
-
-_blend = overload(_area_blend_kernel, half=True)
-_blend_backward = overload(_area_blend_backward_kernel, half=True)
+_made = {n: [overload(kernel, half=True) for kernel in _kernels(n)] for n in BLOCKS}
+_blend = {(dtype, n): forward[dtype] for n, (forward, _) in _made.items() for dtype in forward}
+_blend_backward = {(dtype, n): backward[dtype] for n, (_, backward) in _made.items() for dtype in backward}
 
 
 @torch.library.custom_op("kernels::area_blend", mutates_args=())
 def _area_blend(values: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
     blended = values.new_empty(len(values))
-    launch(_blend[values.dtype], len(values), [values, queries], [blended])
+    for n, part in query_blocks(len(values), values.device):
+        threads = (part.stop - part.start) // n
+        launch(_blend[values.dtype, n], threads, [values[part], queries[part]], [blended[part]])
     return blended
 
 
@@ -72,7 +87,9 @@ def _(values: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
 @torch.library.custom_op("kernels::area_blend_backward", mutates_args=())
 def _area_blend_backward(adj_blended: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
     adj_values = adj_blended.new_empty(len(queries), 4)
-    launch(_blend_backward[adj_blended.dtype], len(queries), [adj_blended, queries], [adj_values])
+    for n, part in query_blocks(len(queries), queries.device):
+        threads = (part.stop - part.start) // n
+        launch(_blend_backward[adj_blended.dtype, n], threads, [adj_blended[part], queries[part]], [adj_values[part]])
     return adj_values
 
 
@@ -87,7 +104,7 @@ def _setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
 
 def _backward(ctx: Any, adj_blended: torch.Tensor) -> tuple[torch.Tensor, None]:
     (queries,) = ctx.saved_tensors
-    return _area_blend_backward(adj_blended, queries), None
+    return _area_blend_backward(adj_blended.contiguous(), queries), None
 
 
 _area_blend.register_autograd(_backward, setup_context=_setup_context)
@@ -116,7 +133,7 @@ def area_blend(values: torch.Tensor, queries: torch.Tensor, backend: str = "warp
     Source: paper Eq. 2 (the weight function S_t / S).
     """
     check_backend(backend)
-    check_floating("values", values, _blend, "(..., Q, 4)")
+    check_floating("values", values, [dtype for dtype, n in _blend if n == 1], "(..., Q, 4)")
     check_queries(queries, values, "values")
     if values.ndim < 2 or values.shape[-2:] != (queries.shape[-2], 4):
         raise ValueError(f"values has shape {tuple(values.shape)}; it should be (..., {queries.shape[-2]}, 4)")

@@ -20,8 +20,19 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.launch import check_backend, check_floating, launch, overload
-from kernels.neighbours import adjoint_of_gather, area, bounds, broadcast_batch, check_queries, query_of
+from kernels.launch import LEAST, check_backend, check_floating, launch, overload
+from kernels.neighbours import (
+    BLOCKS,
+    PARTS,
+    adjoint_of_gather,
+    area,
+    bounds,
+    broadcast_batch,
+    check_queries,
+    query_blocks,
+    query_of,
+    sum_slices,
+)
 from kernels.reference import PRIORS, RANGE_FLOOR
 from kernels.vmap import fold_into_batch
 
@@ -30,9 +41,6 @@ __all__ = ["gather_blend"]
 _BILINEAR = wp.constant(PRIORS.index("bilinear"))
 _PERSPECTIVE = wp.constant(PRIORS.index("perspective"))
 _RANGE_FLOOR = wp.constant(RANGE_FLOOR)
-
-# Queries that a thread takes on a CPU, where their 16 weights make full registers, and on a GPU.
-_BLOCKS = (4, 1)
 
 
 @wp.func
@@ -147,50 +155,62 @@ def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
         adj_weights: wp.array2d[four],
         prior: int,
         wrap: int,
+        slices: int,
+        share: int,
         # out
         adj_scores_out: wp.array2d[four_stored],
         adj_ranges_out: wp.array2d[four],
+        adj_image_out: wp.array3d[wp.Float],
     ):
-        b, q = query_of(first + wp.tid(), weights.shape[1])
-        w = weights[b, q]
-        r = ranges(image, b, queries[b, q], weights.dtype(), wrap)
-        g = adj_blended[b, q]
-        x = weights.dtype()
-        for k in range(m):
-            x[k] = g[k // 4] * r[k]
-        if adj_weights:
-            x = x + adj_weights[b, q]
-        wx = wp.cw_mul(w, x)
-        for k in range(n):
-            mean = wx[4 * k] + wx[4 * k + 1] + wx[4 * k + 2] + wx[4 * k + 3]
-            for t in range(4):
-                x[4 * k + t] = w[4 * k + t] * (x[4 * k + t] - mean)
-        adj_scores = adj_scores_out.dtype()
-        for k in range(m):
-            adj_scores[k] = adj_scores.dtype(x[k])
-        adj_scores_out[b, q] = adj_scores
-        if adj_ranges_out:
+        b, s = query_of(first + wp.tid(), slices)
+        if adj_image_out:
+            for p in range(adj_image_out.shape[2]):
+                adj_image_out[b, s, p] = image.dtype(0.0)
+        for q in range(s * share, wp.min((s + 1) * share, weights.shape[1])):
+            at = queries[b, q]
+            w = weights[b, q]
+            r = ranges(image, b, at, weights.dtype(), wrap)
+            g = adj_blended[b, q]
+            x = weights.dtype()
             for k in range(m):
-                w[k] = g[k // 4] * w[k]
-            if prior == _PERSPECTIVE:
+                x[k] = g[k // 4] * r[k]
+            if adj_weights:
+                x = x + adj_weights[b, q]
+            wx = wp.cw_mul(w, x)
+            for k in range(n):
+                mean = wx[4 * k] + wx[4 * k + 1] + wx[4 * k + 2] + wx[4 * k + 3]
+                for t in range(4):
+                    x[4 * k + t] = w[4 * k + t] * (x[4 * k + t] - mean)
+            adj_scores = adj_scores_out.dtype()
+            for k in range(m):
+                adj_scores[k] = adj_scores.dtype(x[k])
+            adj_scores_out[b, q] = adj_scores
+            if adj_ranges_out or adj_image_out:
                 for k in range(m):
-                    w[k] = w[k] - wp.where(r[k] > w.dtype(_RANGE_FLOOR), x[k] / r[k], w.dtype(0.0))
-            adj_ranges_out[b, q] = w
+                    w[k] = g[k // 4] * w[k]
+                if prior == _PERSPECTIVE:
+                    for k in range(m):
+                        w[k] = w[k] - wp.where(r[k] > w.dtype(_RANGE_FLOOR), x[k] / r[k], w.dtype(0.0))
+            if adj_ranges_out:
+                adj_ranges_out[b, q] = w
+            if adj_image_out:
+                for k in range(n):
+                    above, below, left, right = bounds(at[2 * k], at[2 * k + 1], image.shape[1], image.shape[2], wrap)
+                    p0 = above * image.shape[2] + left
+                    p1 = above * image.shape[2] + right
+                    p2 = below * image.shape[2] + left
+                    p3 = below * image.shape[2] + right
+                    adj_image_out[b, s, p0] = adj_image_out[b, s, p0] + w[4 * k]
+                    adj_image_out[b, s, p1] = adj_image_out[b, s, p1] + w[4 * k + 1]
+                    adj_image_out[b, s, p2] = adj_image_out[b, s, p2] + w[4 * k + 2]
+                    adj_image_out[b, s, p3] = adj_image_out[b, s, p3] + w[4 * k + 3]
 
     return _gather_blend_kernel, _gather_blend_backward_kernel
 
 
-_made = {n: [overload(kernel, half=True) for kernel in _kernels(n)] for n in _BLOCKS}
+_made = {n: [overload(kernel, half=True) for kernel in _kernels(n)] for n in BLOCKS}
 _blend = {(dtype, n): forward[dtype] for n, (forward, _) in _made.items() for dtype in forward}
 _blend_backward = {(dtype, n): backward[dtype] for n, (_, backward) in _made.items() for dtype in backward}
-
-
-def _blocks(count: int, device: torch.device) -> list[tuple[int, slice]]:
-    """Which queries go how many to a thread: on a CPU all but the odd ones at the end go in whole blocks."""
-    whole = 0 if device.type == "cuda" else count - count % _BLOCKS[0]
-    return [
-        (n, slice(*ends)) for n, ends in zip(_BLOCKS, [(0, whole), (whole, count)], strict=True) if ends[0] < ends[1]
-    ]
 
 
 @torch.library.custom_op("kernels::gather_blend", mutates_args=())
@@ -199,7 +219,7 @@ def _gather_blend(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     batch, count, _ = scores.shape
     blended, weights = image.new_empty(batch, count), image.new_empty(batch, count, 4)
-    for n, part in _blocks(count, image.device):
+    for n, part in query_blocks(count, image.device):
         inputs = [image, queries[:, part], scores[:, part], area_floor, prior, int(wrap)]
         outputs = [blended[:, part], weights[:, part]]
         launch(_blend[scores.dtype, n], outputs[0].numel() // n, inputs, outputs)
@@ -225,14 +245,29 @@ def _gather_blend_backward(
     scores: torch.dtype,
     for_image: bool,
 ) -> tuple[torch.Tensor, torch.Tensor]:
+    batch, count, _ = weights.shape
     adj_scores = weights.new_empty(weights.shape, dtype=scores)
-    adj_ranges = weights.new_empty(weights.shape if for_image else 0)
-    for n, part in _blocks(weights.shape[1], weights.device):
+    blocks = query_blocks(count, weights.device)
+    on_cpu = weights.device.type == "cpu"
+    adj_ranges = None if on_cpu or not for_image else weights.new_empty(weights.shape)
+    # On a CPU few threads add up gradients of the image in slices of their own (`kernels.neighbours.sum_by_query`).
+    slices = -(-PARTS // batch) if batch else 1
+    adj_image = weights.new_empty(batch, slices * len(blocks), image[0].numel()) if on_cpu and for_image else None
+    for i, (n, part) in enumerate(blocks):
+        threads, least, own = (part.stop - part.start) // n, LEAST, None
+        share = 1
+        if adj_image is not None:
+            share, threads, least = -(-threads // slices), slices, 1
+            own = adj_image[:, i * slices : (i + 1) * slices]
         adjoints = [adj_blended[:, part], None if adj_weights is None else adj_weights[:, part]]
-        inputs = [image, queries[:, part], weights[:, part], *adjoints, prior, int(wrap)]
-        outputs = [adj_scores[:, part], adj_ranges[:, part] if for_image else None]
-        launch(_blend_backward[scores, n], adj_blended[:, part].numel() // n, inputs, outputs)
-    return adj_scores, adj_ranges
+        inputs = [image, queries[:, part], weights[:, part], *adjoints, prior, int(wrap), threads, share]
+        outputs = [adj_scores[:, part], None if adj_ranges is None else adj_ranges[:, part], own]
+        launch(_blend_backward[scores, n], batch * threads, inputs, outputs, least)
+    if adj_image is not None:
+        return adj_scores, sum_slices(adj_image.unsqueeze(-1)).view(image.shape)
+    if adj_ranges is not None:
+        return adj_scores, adjoint_of_gather(adj_ranges.unsqueeze(-1), queries, *image.shape[1:], wrap).squeeze(-1)
+    return adj_scores, image.new_empty(0)
 
 
 @_gather_blend_backward.register_fake
@@ -247,7 +282,7 @@ def _(
     scores: torch.dtype,
     for_image: bool,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    return weights.new_empty(weights.shape, dtype=scores), weights.new_empty(weights.shape if for_image else 0)
+    return weights.new_empty(weights.shape, dtype=scores), image.new_empty(image.shape if for_image else 0)
 
 
 def _setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
@@ -264,13 +299,10 @@ def _backward(
     adj_blended = weights.new_zeros(weights.shape[:2]) if adj_blended is None else adj_blended.contiguous()
     adj_weights = None if adj_weights is None else adj_weights.contiguous()
     for_image = ctx.needs_input_grad[0]
-    adj_scores, adj_ranges = _gather_blend_backward(
+    adj_scores, adj_image = _gather_blend_backward(
         image, queries, weights, adj_blended, adj_weights, ctx.prior, ctx.wrap, ctx.scores, for_image
     )
-    adj_image = None
-    if for_image:
-        adj_image = adjoint_of_gather(adj_ranges.unsqueeze(-1), queries, *image.shape[1:], ctx.wrap).squeeze(-1)
-    return adj_image, None, adj_scores, None, None, None
+    return adj_image if for_image else None, None, adj_scores, None, None, None
 
 
 _gather_blend.register_autograd(_backward, setup_context=_setup_context)

@@ -16,6 +16,7 @@ import warp as wp
 
 __all__ = [
     "BACKENDS",
+    "LEAST",
     "check_backend",
     "check_floating",
     "initialise",
@@ -28,7 +29,7 @@ __all__ = [
 BACKENDS = ("warp", "torch")
 
 # Below this many threads of work a second core costs more to wake than it saves.
-_MIN_CHUNK = 512
+LEAST = 512
 # More chunks than cores, so that a core which drew the cheap ones takes another.
 _CHUNKS_PER_CORE = 4
 
@@ -184,7 +185,7 @@ def _to_warp(argument: Any, annotation: Any) -> Any:
     return wp.from_torch(argument.detach(), requires_grad=False, return_ctype=True)
 
 
-def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[Any], least: int = _MIN_CHUNK) -> None:
+def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[Any], least: int = LEAST) -> None:
     """Runs `threads` threads of a kernel on the device of its outputs and waits for nothing but CPU work.
 
     A kernel's first argument is `first: int`, the number of its first thread: Warp runs a CPU launch on one core,

@@ -292,9 +292,11 @@ def project_pixels(
         qkv_weight = qkv_weight.unflatten(0, (3, channels))[:, head_last(channels, heads, z.device)].flatten(0, 1)
         projection = qkv_weight * norm[0]
         # One matrix makes the row of a pixel from (x, mean, xᵀx).
-        of_x = torch.cat((projection.T, torch.eye(channels).to(x), x.new_zeros(channels, 1), centred), 1)
-        of_mean = torch.cat((x.new_zeros(3 * channels), x.new_ones(channels), x.new_zeros(3))).unsqueeze(0)
-        of_squares = F.one_hot(torch.tensor([4 * channels], device=x.device), 4 * channels + 3).to(x)
+        of_x = torch.cat(
+            (projection.T, torch.eye(channels, dtype=x.dtype, device=x.device), x.new_zeros(channels, 1), centred), 1
+        )
+        of_mean = F.pad(x.new_ones(1, channels), (3 * channels, 3))
+        of_squares = F.pad(x.new_ones(1, 1), (4 * channels, 2))
         rows = F.pad(torch.cat((of_x, of_mean, of_squares)), (0, MOMENTS - 3))
         pixels = torch.cat((x, mean, (x * x).sum(-1, keepdim=True)), -1) @ rows
         slope = torch.cat((projection @ centred, position[0])).T.contiguous()

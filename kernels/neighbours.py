@@ -15,6 +15,8 @@ from kernels.launch import lanes, launch, overload, overload_vectors
 from kernels.vmap import fold_into_batch
 
 __all__ = [
+    "BLOCKS",
+    "PARTS",
     "adjoint_of_gather",
     "area",
     "bounds",
@@ -23,10 +25,12 @@ __all__ = [
     "check_queries",
     "neighbour",
     "offset",
+    "query_blocks",
     "query_of",
     "sort_queries",
     "sum_by_pixel",
     "sum_by_query",
+    "sum_slices",
 ]
 
 
@@ -249,7 +253,7 @@ _add_gradients = overload_vectors(_add_gradients_kernel)
 _sum_slices = overload_vectors(_sum_slices_kernel)
 
 # Threads of the sum on a CPU. A constant: the number of cores does not change the rounding.
-_PARTS = 8
+PARTS = 8
 
 
 def sort_queries(queries: torch.Tensor, height: int, width: int, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
@@ -314,8 +318,8 @@ def sum_by_query(gradients: torch.Tensor, queries: torch.Tensor, height: int, wi
     batch, _, _, channels = gradients.shape
     lane = lanes(channels)
     blocks = channels // lane
-    spans = min(blocks, -(-_PARTS // batch))
-    slices = -(-_PARTS // (batch * spans))
+    spans = min(blocks, -(-PARTS // batch))
+    slices = -(-PARTS // (batch * spans))
     shares = gradients.new_empty(batch * slices, height * width, channels)
     span = -(-blocks // spans)
     launch(
@@ -325,11 +329,16 @@ def sum_by_query(gradients: torch.Tensor, queries: torch.Tensor, height: int, wi
         [shares],
         least=1,
     )
+    return sum_slices(shares.view(batch, slices, height * width, channels)).view(batch, height, width, channels)
+
+
+def sum_slices(slices: torch.Tensor) -> torch.Tensor:
+    """(B, P, C), the sum of slices (B, S, P, C) in their order."""
     # Not `sum`: torch's threads, once woken, spin for milliseconds on cores that the next launch wants.
-    pixels = gradients.new_empty(batch, height, width, channels)
-    inputs = [shares.view(batch, slices, height * width, channels), 0.0]
-    launch(_sum_slices[gradients.dtype, lane], pixels.numel() // lane, inputs, [pixels.flatten(1, 2)])
-    return pixels
+    sums = slices.new_empty(slices.shape[0], *slices.shape[2:])
+    lane = lanes(slices.shape[3])
+    launch(_sum_slices[slices.dtype, lane], sums.numel() // lane, [slices, 0.0], [sums])
+    return sums
 
 
 @adjoint_of_gather.register_fake
@@ -338,6 +347,17 @@ def _(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, w
 
 
 fold_into_batch(adjoint_of_gather)
+
+
+# Queries that a thread takes on a CPU, where the vectors of so many fill its registers, and on a GPU.
+BLOCKS = (4, 1)
+
+
+def query_blocks(count: int, device: torch.device) -> list[tuple[int, slice]]:
+    """Which queries go how many to a thread: on a CPU all but the odd ones at the end go in whole blocks."""
+    whole = 0 if device.type == "cuda" else count - count % BLOCKS[0]
+    parts = zip(BLOCKS, [(0, whole), (whole, count)], strict=True)
+    return [(n, slice(*ends)) for n, ends in parts if ends[0] < ends[1]]
 
 
 def channel_spans(blocks: int, device: torch.device) -> tuple[int, int]:

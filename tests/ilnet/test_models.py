@@ -196,6 +196,84 @@ def test_upsample_decodes_in_pieces_of_bounded_size(yard):
     assert max(sizes) == base._TILE["cpu"]
 
 
+@pytest.mark.parametrize("depth", [0, 1, 2])
+@pytest.mark.parametrize("training", [True, False])
+def test_a_network_answers_alike_in_training_in_a_frame_and_in_plain_torch(depth, training, yard):
+    """The paper's width: CPUs decode a frame in one pass, and train on one kernel a direction."""
+    torch.manual_seed(0)
+    model = models.ILN(depth, "perspective", blocks=1).train(training)
+    torch.nn.init.normal_(model.head[1].weight, std=0.5)
+    scan = simulate(yard, preset("paper-16x1024").resize(8, 128), pose((0.0, 0.0, 1.8)))
+    target = scan.sensor.resize(20, 300)
+    queries = scan.sensor.grid_queries(target).view(1, -1, 2)
+    image = scan.filled().unsqueeze(0)
+    expected = plain_iln(model, image, queries, scan.sensor.wrap).view(target.shape)
+    gradients = []
+    for backend in ("warp", "torch"):
+        model.backend = backend
+        torch.testing.assert_close(model.ranges(scan, target), expected, rtol=0, atol=METRES)
+        ranges = model(image, queries, scan.sensor.wrap)
+        torch.testing.assert_close(ranges.view(target.shape), expected, rtol=0, atol=METRES)
+        gradients.append(torch.autograd.grad(ranges.mean(), list(model.parameters())))
+    for ours, plain in zip(*gradients, strict=True):
+        torch.testing.assert_close(ours, plain, rtol=1e-2, atol=GRADIENT)
+
+
+def test_dropout_is_active_in_training_only(yard):
+    model, (image, queries) = small(dropout=0.5), draw()
+    assert torch.equal(model(image, queries), model(image, queries))
+    model.train()
+    assert not torch.equal(model(image, queries), model(image, queries))
+
+
+@pytest.mark.parametrize("name", ["liif", "iln", "bilinear"])
+def test_bfloat16_is_close_and_ranges_stay_float32(name, yard):
+    torch.manual_seed(0)
+    model = models.create(name, blocks=4).eval() if name in models.TRAINABLE else models.create(name)
+    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    exact = model.ranges(scan, preset("paper-64x1024"))
+    rounded = model.ranges(scan, preset("paper-64x1024"), "bfloat16")
+    assert rounded.dtype == torch.float32
+    assert torch.equal(exact, rounded) == (name == "bilinear")
+    # LIIF predicts values, and bfloat16 has 8 bits for its 100 m; weights blend what was measured.
+    assert (exact - rounded).abs().mean() < (0.5 if name == "liif" else 0.02)
+
+
+def test_an_upsampler_serves_many_frames_of_its_sensor_only(yard):
+    model = small("bilinear")
+    source, target = preset("paper-16x1024"), preset("paper-64x1024")
+    upsampler = models.Upsampler(model, source, target)
+    for x in (0.0, 3.0):
+        scan = simulate(yard, source, pose((x, 0.0, 1.8)))
+        assert torch.equal(upsampler(scan).ranges, model.upsample(scan, target).ranges)
+        assert upsampler(scan).sensor == target
+    with pytest.raises(ValueError, match="this upsampler was made for"):
+        upsampler(simulate(yard, target, pose((0.0, 0.0, 1.8))))
+    with pytest.raises(ValueError, match="precision is 'half'; it should be one of float32, bfloat16"):
+        models.Upsampler(model, source, target, "half")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("precision", models.PRECISIONS)
+def test_on_cuda_frames_replay_a_graph_without_a_word_from_the_host(precision, yard):
+    torch.manual_seed(0)
+    model = models.ILN(blocks=2).eval()
+    source, target = preset("paper-16x1024"), preset("paper-64x1024")
+    scans = [simulate(yard, source, pose((x, 0.0, 1.8))) for x in (0.0, 3.0, 6.0)]
+    expected = [model.ranges(scan, target) for scan in scans]
+    upsampler = models.Upsampler(model.cuda(), source, target, precision, "cuda")
+    moved = [Scan(scan.ranges.cuda(), source) for scan in scans]
+    upsampler.ranges(moved[0])
+    mode = torch.cuda.get_sync_debug_mode()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        answers = [upsampler.ranges(scan) for scan in moved]
+    finally:
+        torch.cuda.set_sync_debug_mode(mode)
+    for answer, exact in zip(answers, expected, strict=True):
+        assert (answer.cpu() - exact).abs().mean() < (METRES if precision == "float32" else 0.02)
+
+
 def test_bilinear_upsampling_is_close_to_the_truth_on_the_ground(yard):
     here = pose((60.0, -60.0, 1.8))
     scan = simulate(yard, preset("paper-16x1024"), here)
