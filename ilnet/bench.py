@@ -78,6 +78,8 @@ def _compare(name: str, size: str, ours: Work, others: dict[str, Work], repeat: 
         for _ in range(ROUNDS):
             for work, seconds in zip((ours, other), times, strict=True):
                 time.sleep(0.1)  # torch's threads stay awake for a while, on cores that the next one wants
+                for _ in range(repeat // 5):  # back to its warm state; what takes long is not as sensitive
+                    work()
                 for _ in range(repeat):
                     _wait()
                     start = time.perf_counter()
@@ -181,7 +183,7 @@ def _both(
         compiled = _compiled(plain, device)
         if compiled is not None and words == "eager torch":
             others["torch.compile"] = wrap(compiled)
-        yield from _compare(name + suffix, size, wrap(ours), others, repeat=7)
+        yield from _compare(name + suffix, size, wrap(ours), others, repeat=15)
 
 
 def _grid_sample(image: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:

@@ -47,9 +47,9 @@ class Model(nn.Module):
         """Answers queries (B, Q, 2) with ranges (B, Q) [m], from what `encode` made of the image."""
         raise NotImplementedError
 
-    def tile(self, encoded: Any) -> int | None:
-        """How many queries `Upsampler` gives to `decode` at a time; None for all."""
-        return _TILE[next((p.device.type for p in self.parameters()), "cpu")]
+    def is_fused(self, encoded: Any) -> bool:
+        """Whether `decode` holds nothing per query, so that `Upsampler` need not give it tiles."""
+        return False
 
     def forward(self, image: torch.Tensor, queries: torch.Tensor, wrap: bool = True) -> torch.Tensor:
         """Predicts the range along each queried direction.
@@ -163,7 +163,7 @@ class Upsampler:
             encoded = model.encode(image, wrap)
             count = self._queries.shape[1]
             answer = image.new_empty(1, count)
-            tile = model.tile(encoded) or count
+            tile = count if model.is_fused(encoded) else _TILE[self.device.type]
             for begin in range(0, count, tile):
                 part = slice(begin, begin + tile)
                 answer[:, part] = model.decode(encoded, image, self._queries[:, part], wrap)

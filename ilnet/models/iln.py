@@ -131,7 +131,7 @@ class ILN(Model):
         if projected is None:
             z, offsets = gather_neighbours(features, queries, wrap, self.backend)
             z = z + self.position(offsets * OFFSET_SCALE)
-        elif self._is_fused(projected):
+        elif self.is_fused(encoded):
             weights = self._decoder_weights()
             return fused_decode(projected, image, queries, weights, self.prior, wrap, area_floor=self.area_floor)
         else:
@@ -144,14 +144,10 @@ class ILN(Model):
         scores = self.head(z).squeeze(-1).to(image.dtype)
         return gather_blend(image, queries, scores, self.prior, wrap, area_floor=self.area_floor, backend=self.backend)
 
-    def tile(self, encoded: _Encoded) -> int | None:
-        """The fused decoder holds nothing per query."""
-        fused = encoded.projected is not None and self._is_fused(encoded.projected)
-        return None if fused else super().tile(encoded)
-
-    def _is_fused(self, projected: Projected) -> bool:
-        inference = self.backend == "warp" and not torch.is_grad_enabled()
-        return inference and len(self.blocks) == 1 and fused_decode_serves(projected)
+    def is_fused(self, encoded: _Encoded) -> bool:
+        """Whether the whole decoder is one kernel: in inference, at depth 1, where `fused_decode` serves."""
+        projected, inference = encoded.projected, self.backend == "warp" and not torch.is_grad_enabled()
+        return projected is not None and inference and len(self.blocks) == 1 and fused_decode_serves(projected)
 
     def _first(self) -> _Block:
         block = self.blocks[0]
