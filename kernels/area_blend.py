@@ -57,9 +57,9 @@ def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
         at = queries[q]
         g = adj_blended[q]
         x = adj_values_out.dtype()
-        for k in range(4 * n):
-            weight = area(at[k // 4 * 2], at[k // 4 * 2 + 1], k % 4)
-            x[k] = x.dtype(weight * queries.dtype.dtype(g[k // 4]))
+        for k in range(n):
+            for t in range(4):
+                x[4 * k + t] = x.dtype(area(at[2 * k], at[2 * k + 1], t) * queries.dtype.dtype(g[k]))
         adj_values_out[q] = x
 
     return _area_blend_kernel, _area_blend_backward_kernel
