@@ -322,18 +322,22 @@ def rays() -> Iterator[Row]:
     street = data.street(demo.TOWN, 0, device)
     pose = street.pose(0)
     for sensor in (preset("paper-64x1024"), preset(OUTPUT), preset(OUTPUT).resize(*LARGE)):
+        size = "{}x{} rays in {}".format(*sensor.shape, demo.TOWN)
         cast = partial(_cast, street, sensor, pose)
-        yield from _compare(
-            "rays-bvh",
-            "{}x{} rays in {}".format(*sensor.shape, demo.TOWN),
-            cast,
-            {"the same BVH on one core, as Warp launches it": partial(_on_one_core, cast)},
-            repeat=3,
-        )
+        alone: dict[str, Work] = {"the same BVH on one core, as Warp launches it": partial(_on_one_core, cast)}
+        yield from _compare("rays-bvh", size, cast, alone, repeat=3)
+        project = partial(_project, street, sensor, pose)
+        yield from _compare("rays-projection", size, project, {"our BVH on all cores": cast}, repeat=3)
 
 
 def _cast(street: data.Street, sensor: Sensor, pose: torch.Tensor) -> list[torch.Tensor]:
     return [simulate(street.mesh, sensor, pose).ranges]
+
+
+def _project(street: data.Street, sensor: Sensor, pose: torch.Tensor) -> list[torch.Tensor]:
+    tables = torch.tensor(sensor.elevations), torch.tensor(sensor.azimuths)
+    ranges = street.mesh.project(pose, *tables, sensor.max_range)
+    return [ranges.where(ranges >= sensor.min_range, 0.0)]
 
 
 def _on_one_core(work: Work) -> list[torch.Tensor]:

@@ -9,6 +9,7 @@ import warp as wp
 from kernels import reference
 from kernels.launch import check_backend, check_floating, initialise, launch
 from kernels.neighbours import broadcast_batch
+from kernels.projection import project_triangles
 
 __all__ = ["Hits", "Mesh"]
 
@@ -165,3 +166,34 @@ class Mesh:
             inputs = [self._mesh.id, origins, directions, float(max_range)]
             launch(_cast_rays_kernel, len(origins), inputs, [ranges, triangles, cosines])
         return Hits(ranges.view(batch), triangles.view(batch), cosines.view(batch))
+
+    def project(
+        self, pose: torch.Tensor, elevations: torch.Tensor, azimuths: torch.Tensor, max_range: float
+    ) -> torch.Tensor:
+        """Finds the range along each ray of a range image, whose rays all start at one point, without walking a tree.
+
+        The same ranges as `cast` gives, but for rays that graze an edge. The time hardly grows with the number of rays:
+        on a CPU faster than `cast` for more than some tens of thousands in a mesh of half a million triangles.
+
+        Args:
+            pose: (4, 4) transform from the sensor frame to that of the vertices, a rotation and a translation [m].
+            elevations: (H,) rad, of the rows, within ±90 degrees.
+            azimuths: (W,) rad, of the columns, all different, within one turn.
+            max_range: Metres; farther surfaces are not seen.
+
+        Returns:
+            (H, W) float32 metres; 0 where nothing is met.
+
+        Raises:
+            ValueError: If a shape does not fit, a table is empty or not finite, or `max_range` is not positive.
+        """
+        if pose.shape != (4, 4) or not pose.isfinite().all():
+            raise ValueError(f"pose has shape {tuple(pose.shape)}; it should be (4, 4), of finite numbers")
+        for name, table in (("elevations", elevations), ("azimuths", azimuths)):
+            if table.ndim != 1 or len(table) == 0 or not table.isfinite().all():
+                raise ValueError(f"{name} has shape {tuple(table.shape)}; it should be a list of finite numbers")
+        if not max_range > 0:
+            raise ValueError(f"max_range is {max_range}; it should be a number of metres above 0")
+        pose = pose.to(self.device).double()
+        corners = (self._vertices - (pose[:3, 3] - self._middle).float()) @ pose[:3, :3].float()
+        return project_triangles(corners, self._triangles, elevations, azimuths, float(max_range))

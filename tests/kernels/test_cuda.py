@@ -17,6 +17,7 @@ MODULES = [
     "gather_blend",
     "neighbour_attention",
     "neighbours",
+    "projection",
     "raycast",
 ]
 
