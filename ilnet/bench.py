@@ -387,6 +387,9 @@ def bench(sections: tuple[str, ...]) -> list[Row]:
 
     Args:
         sections: Some of `SECTIONS`; none stands for all.
+
+    Returns:
+        The rows in the order in which they were measured.
     """
     rows = []
     with tqdm(unit=" rows", desc="bench") as progress:

@@ -173,7 +173,7 @@ class Mesh:
         """Finds the range along each ray of a range image, whose rays all start at one point, without walking a tree.
 
         The same ranges as `cast` gives, but for rays that graze an edge. The time hardly grows with the number of rays:
-        on a CPU faster than `cast` for more than some tens of thousands in a mesh of half a million triangles.
+        on a CPU faster than `cast` for more than some hundred thousand in a mesh of half a million triangles.
 
         Args:
             pose: (4, 4) transform from the sensor frame to that of the vertices, a rotation and a translation [m].

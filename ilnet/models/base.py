@@ -106,8 +106,8 @@ class Upsampler:
     """Makes scans of one sensor from scans of another, frame after frame.
 
     What frames have in common is prepared once. A frame is encoded once and its queries are decoded in tiles; beyond
-    the output the memory needed does not grow with their number. On CUDA the first frame is recorded as a graph and the
-    following ones replay it, without a word from the host in between.
+    the output the memory needed does not grow with their number. On CUDA the second frame is recorded as a graph and the
+    following ones replay it, without a word from the host in between; a single frame is not worth a recording.
 
     Args:
         model: Whose weights are used as they are at each call; on CUDA they may change, but not move.
@@ -136,6 +136,7 @@ class Upsampler:
         queries = source.grid_queries(target)
         self._seen = source.contains(queries).to(self.device)
         self._queries = queries.view(1, -1, 2).to(self.device)
+        self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
 
     @torch.no_grad()
@@ -170,14 +171,11 @@ class Upsampler:
         return answer
 
     def _replay(self, image: torch.Tensor) -> torch.Tensor:
+        if not self._warm:  # a recording may neither load kernels nor try out algorithms
+            self._warm = True
+            return self._answer(image)
         if self._graph is None:
             self._image = image.clone()
-            # Before the recording, which may neither load kernels nor try out algorithms.
-            aside = torch.cuda.Stream(self.device)
-            aside.wait_stream(torch.cuda.current_stream(self.device))
-            with torch.cuda.stream(aside):
-                self._answer(self._image)
-            torch.cuda.current_stream(self.device).wait_stream(aside)
             self._graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(self._graph):
                 self._recorded = self._answer(self._image)

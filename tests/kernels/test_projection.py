@@ -51,7 +51,8 @@ def test_gives_the_ranges_that_the_tree_gives(tables, position, device):
     expected = cast(mesh, pose, *TABLES[tables], 60.0)
     assert ranges.shape == expected.shape
     assert ((ranges - expected).abs() > METRES).double().mean() <= GRAZING
-    assert (expected > 0).any() == (position[0] < 100 and tables != "one ray") or tables == "one ray"
+    if tables != "one ray":
+        assert (expected > 0).any() == (position[0] < 100)  # 300 m away there is nothing to see
 
 
 def test_a_floor_below_and_a_ceiling_above(device):
