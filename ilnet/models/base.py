@@ -106,8 +106,8 @@ class Upsampler:
     """Makes scans of one sensor from scans of another, frame after frame.
 
     What frames have in common is prepared once. A frame is encoded once and its queries are decoded in tiles; beyond
-    the output the memory needed does not grow with their number. On CUDA the second frame is recorded as a graph and the
-    following ones replay it, without a word from the host in between; a single frame is not worth a recording.
+    the output the memory needed does not grow with their number. On CUDA the second frame is recorded as a graph and
+    the following ones replay it, without a word from the host in between; a single frame is not worth a recording.
 
     Args:
         model: Whose weights are used as they are at each call; on CUDA they may change, but not move.
