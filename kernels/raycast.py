@@ -1,5 +1,6 @@
 """A mesh and its rays: nearest hits through Warp's bounding volume hierarchy, one thread a ray."""
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ import warp as wp
 from kernels import reference
 from kernels.launch import check_backend, check_floating, initialise, launch
 from kernels.neighbours import broadcast_batch
-from kernels.projection import project_triangles
+from kernels.projection import Clusters, cluster_triangles, project_triangles
 
 __all__ = ["Hits", "Mesh"]
 
@@ -107,14 +108,24 @@ class Mesh:
         self._middle = ((points.amin(0) + points.amax(0)).double() / 2).round().to(self.device)
         self._vertices = (points.to(self.device).double() - self._middle).float()
         self._triangles = faces.to(self.device, torch.int32).contiguous()
+
+    # Made when they are first asked for: few meshes need both.
+
+    @cached_property
+    def _tree(self) -> wp.Mesh:
         if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)  # the copies ran on torch's stream, and the mesh is built on Warp's
-        self._mesh = wp.Mesh(
+            torch.cuda.synchronize(self.device)  # the copies ran on torch's stream, and the tree is built on Warp's
+        tree = wp.Mesh(
             points=wp.from_torch(self._vertices, dtype=wp.vec3),
             indices=wp.from_torch(self._triangles.view(-1), dtype=wp.int32),
         )
         if self.device.type == "cuda":
             wp.synchronize_device(str(self.device))  # and used on torch's again
+        return tree
+
+    @cached_property
+    def _clusters(self) -> Clusters:
+        return cluster_triangles(self._vertices, self._triangles)
 
     def cast(self, origins: torch.Tensor, directions: torch.Tensor, max_range: float, backend: str = "warp") -> Hits:
         """Finds the nearest hit of each ray.
@@ -163,7 +174,7 @@ class Mesh:
             ranges = origins.new_empty(len(origins))
             triangles = torch.empty_like(ranges, dtype=torch.int32)
             cosines = torch.empty_like(ranges)
-            inputs = [self._mesh.id, origins, directions, float(max_range)]
+            inputs = [self._tree.id, origins, directions, float(max_range)]
             launch(_cast_rays_kernel, len(origins), inputs, [ranges, triangles, cosines])
         return Hits(ranges.view(batch), triangles.view(batch), cosines.view(batch))
 
@@ -195,5 +206,5 @@ class Mesh:
         if not max_range > 0:
             raise ValueError(f"max_range is {max_range}; it should be a number of metres above 0")
         pose = pose.to(self.device).double()
-        corners = (self._vertices - (pose[:3, 3] - self._middle).float()) @ pose[:3, :3].float()
-        return project_triangles(corners, self._triangles, elevations, azimuths, float(max_range))
+        origin, rotation = pose[:3, 3] - self._middle, pose[:3, :3]
+        return project_triangles(self._clusters, origin, rotation, elevations, azimuths, float(max_range))
