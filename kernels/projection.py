@@ -18,7 +18,7 @@ import warp as wp
 
 from kernels.launch import launch
 
-__all__ = ["Clusters", "cluster_triangles", "project_triangles"]
+__all__ = ["Clusters", "cluster_triangles", "project_triangles", "within_reach"]
 
 # Triangles of a cluster.
 _SIZE = wp.constant(64)
@@ -319,6 +319,12 @@ def project_triangles(
     image = torch.empty_like(ranges.T).contiguous()
     image[row_order.unsqueeze(1), column_order] = ranges.T
     return image.masked_fill_(image.isinf(), 0.0)
+
+
+def within_reach(clusters: Clusters, origin: torch.Tensor, max_range: float) -> int:
+    """Counts the triangles of the clusters that begin within `max_range` [m] of an origin (3,) [m]."""
+    distance = (clusters.centres - origin.float()).norm(dim=1)
+    return int((distance - clusters.radii <= max_range).sum()) * int(_SIZE)
 
 
 def _seen(

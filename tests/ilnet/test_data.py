@@ -88,7 +88,7 @@ def test_held_out_scans_come_from_waypoints_spread_over_the_town():
     assert [[s.ranges.shape for s in pair] for pair in pairs] == [[(16, 1024), (64, 1024)]] * 3
     for scan, dense in pairs:
         assert (scan.ranges > 0).float().mean() > 0.5
-        # The outermost beams are the same beams.
-        assert torch.equal(scan.ranges[0], dense.ranges[0])
-        assert torch.equal(scan.ranges[15], dense.ranges[63])
+        # The outermost beams are the same beams, and other engines may have cast them.
+        for few, many in ((0, 0), (15, 63)):
+            assert ((scan.ranges[few] - dense.ranges[many]).abs() > 1e-3).double().mean() < 1e-3
     assert not torch.equal(pairs[0][0].ranges, pairs[1][0].ranges)
