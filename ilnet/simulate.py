@@ -9,7 +9,7 @@ from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 from kernels import Mesh
 
-__all__ = ["World", "best_device", "measure", "pose", "ranges", "simulate"]
+__all__ = ["World", "best_device", "cast", "nearest", "pose", "ranges", "simulate"]
 
 Angle = float | torch.Tensor
 # One mesh or several: a town, and the traffic in it.
@@ -50,34 +50,29 @@ def pose(
     return torch.stack(entries, -1).unflatten(-1, (4, 4))
 
 
-def measure(world: World, sensor: Sensor, pose: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-    """Measures ranges along any directions, with the range limits of a sensor.
+def cast(mesh: Mesh, pose: torch.Tensor, directions: torch.Tensor, max_range: float) -> torch.Tensor:
+    """Casts rays along any directions.
 
     Args:
-        world: Meshes, metres; what is nearest is measured.
-        sensor: Whose limits hold.
-        pose: (..., 4, 4) transforms from the sensor frame to the world.
+        mesh: Metres.
+        pose: (..., 4, 4) transforms from the sensor frame to that of the mesh.
         directions: (..., N, 3) unit vectors in the sensor frame.
+        max_range: Metres.
 
     Returns:
-        (..., N) float32 metres on the meshes' device; 0 where nothing is met between minimum and maximum range.
+        (..., N) float32 metres on the mesh's device; 0 where nothing is met.
     """
-    meshes = [world] if isinstance(world, Mesh) else world
-    return _limited([_cast(mesh, pose, directions, sensor.max_range) for mesh in meshes], sensor)
-
-
-def _cast(mesh: Mesh, pose: torch.Tensor, directions: torch.Tensor, max_range: float) -> torch.Tensor:
     pose = pose.to(mesh.device)
     turned = directions.to(mesh.device).double() @ pose[..., :3, :3].mT
     return mesh.cast(pose[..., None, :3, 3], turned, max_range).range
 
 
-def _limited(found: list[torch.Tensor], sensor: Sensor) -> torch.Tensor:
-    """The nearest of several ranges, 0 being none, within the limits of a sensor."""
-    nearest = found[0]
-    for other in found[1:]:
-        nearest = other.where((nearest == 0) | (other > 0) & (other < nearest), nearest)
-    return nearest.where(nearest >= sensor.min_range, 0.0)
+def nearest(found: Sequence[torch.Tensor]) -> torch.Tensor:
+    """The nearest of several ranges of the same rays, 0 being none."""
+    ranges, *others = found
+    for other in others:
+        ranges = other.where((ranges == 0) | (other > 0) & (other < ranges), ranges)
+    return ranges
 
 
 def ranges(world: World, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
@@ -92,8 +87,8 @@ def ranges(world: World, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
         (..., H, W) float32 metres on the meshes' device; 0 where nothing is met between minimum and maximum range.
     """
     meshes = [world] if isinstance(world, Mesh) else world
-    found = [_images(mesh, sensor, poses.view(-1, 4, 4)) for mesh in meshes]
-    return _limited(found, sensor).view(*poses.shape[:-2], *sensor.shape)
+    found = nearest([_images(mesh, sensor, poses.view(-1, 4, 4)) for mesh in meshes])
+    return found.where(found >= sensor.min_range, 0.0).view(*poses.shape[:-2], *sensor.shape)
 
 
 def _images(mesh: Mesh, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
@@ -105,7 +100,7 @@ def _images(mesh: Mesh, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
         if len(some) == 1 and mesh.projects_faster(some[0, :3, 3], rays, sensor.max_range):
             images.append(mesh.project(some[0], *tables, sensor.max_range).unsqueeze(0))
         else:
-            images.append(_cast(mesh, some, directions, sensor.max_range).view(-1, *sensor.shape))
+            images.append(cast(mesh, some, directions, sensor.max_range).view(-1, *sensor.shape))
     return torch.cat(images)
 
 

@@ -54,7 +54,11 @@ def _fleet() -> tuple[_Kind, ...]:
 
 
 def traffic(
-    town: Town, at: ArrayLike, seed: int | Sequence[int], radius: float = 85.0
+    town: Town,
+    at: ArrayLike,
+    seed: int | Sequence[int],
+    radius: float = 85.0,
+    sector: tuple[float, float] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draws the vehicles and people around a sensor; another seed draws others, more of them or fewer.
 
@@ -65,6 +69,8 @@ def traffic(
         at: (3,) position of the sensor, metres.
         seed: Of the draw; the same town, place and seed give the same arrays.
         radius: How far from the sensor they are drawn, metres.
+        sector: The direction [rad, from +x] in which a sensor looks that does not turn full circle, and half the width
+            [rad] of what it sees; what stands elsewhere is left out, and the rest stays as it is.
 
     Returns:
         Vertices (V, 3) float32 [m] and triangles (F, 3) int32; empty where nothing is about.
@@ -82,12 +88,25 @@ def traffic(
     heading = lane[_distance(lane, sensor).argmin(), 3] if len(lane) else 0.0
     keep = _apart(things, sensor, heading)
     things = _Things(*(column[keep] for column in things))
-    part = merge([_instances(things, number, rng) for number in range(len(_fleet()))])
+    scale = rng.uniform(2 - _STRETCH, _STRETCH, (len(keep), 3))
+    if sector:
+        seen = _in_sector(things, sensor, *sector)
+        things, scale = _Things(*(column[seen] for column in things)), scale[seen]
+    part = merge([_instances(things, number, scale) for number in range(len(_fleet()))])
     return raster(part.vertices), part.triangles.astype(np.int32)
 
 
 def _distance(points: np.ndarray, sensor: np.ndarray) -> np.ndarray:
     return np.hypot(points[:, 0] - sensor[0], points[:, 1] - sensor[1])
+
+
+def _in_sector(things: _Things, sensor: np.ndarray, heading: float, half: float) -> np.ndarray:
+    """Which things (N,) reach into a sector, judged by the circles around them."""
+    away = things.spot[:, :2] - sensor
+    distance = np.hypot(away[:, 0], away[:, 1])
+    reach = np.array([np.hypot(k.half_length, k.half_width) for k in _fleet()])[things.kind]
+    aside = np.abs(np.mod(np.arctan2(away[:, 1], away[:, 0]) - heading + np.pi, 2 * np.pi) - np.pi)
+    return (distance <= reach) | (aside < half + np.arcsin(np.minimum(reach / np.maximum(distance, 1e-9), 1)))
 
 
 def _slope(town: Town, near: np.ndarray) -> np.ndarray:
@@ -175,15 +194,13 @@ def _apart(things: _Things, sensor: np.ndarray, heading: float) -> np.ndarray:
     return np.nonzero(kept[1:])[0]
 
 
-def _instances(things: _Things, number: int, rng: np.random.Generator) -> Part:
-    """All things of one kind, a little different in size, and tilted as the road is."""
+def _instances(things: _Things, number: int, scale: np.ndarray) -> Part:
+    """All things of one kind, tilted as the road is; scale (N, 3) is of all things."""
     pick = things.kind == number
-    count = int(pick.sum())
-    if not count:
+    if not pick.any():
         return EMPTY
     part = _fleet()[number].part
-    scale = rng.uniform(2 - _STRETCH, _STRETCH, (count, 3))
     spot = things.spot[pick]
-    placed = place(part, spot[:, :3], spot[:, 3], scale)
-    rise = part.vertices[:, 0] * (scale[:, :1] * things.slope[pick, None])
+    placed = place(part, spot[:, :3], spot[:, 3], scale[pick])
+    rise = part.vertices[:, 0] * (scale[pick, :1] * things.slope[pick, None])
     return Part(placed.vertices + np.array([0.0, 0.0, 1.0]) * rise.reshape(-1, 1), placed.triangles)

@@ -178,3 +178,14 @@ def test_no_traffic_where_there_are_no_lanes(town):
 def test_unknown_name_is_refused():
     with pytest.raises(ValueError, match=r"'nowhere'.*town01"):
         towns.build("nowhere")
+
+
+def test_a_sector_of_the_traffic_is_the_part_of_it_that_a_sensor_sees_there(town):
+    at = town.waypoints[400].astype(float) + (0, 0, SENSOR_HEIGHT)
+    whole, part = (Mesh(*towns.traffic(town, at, 5, sector=s)) for s in (None, (2.5, 0.6)))
+    azimuth = np.linspace(2.5 - 0.6, 2.5 + 0.6, 400)
+    way = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(400, -0.05)], axis=1)
+    seen = _cast(whole, at[None], way)
+    assert (seen > 0).any()
+    np.testing.assert_array_equal(_cast(part, at[None], way), seen)
+    assert len(towns.traffic(town, at, 5, sector=(2.5, 0.6))[1]) < 0.5 * len(towns.traffic(town, at, 5)[1])
