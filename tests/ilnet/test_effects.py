@@ -307,14 +307,16 @@ def test_both_motions_together_drive_an_arc():
     torch.testing.assert_close(found, expected, atol=METRES, rtol=0)
 
 
-def test_pitching_tilts_the_ground():
+def test_pitch_and_roll_tilt_the_ground():
     sensor, passed = turn(falling=False)
-    found = scan(Effects(angular_velocity=(0, 0.8, 0)), plates(GROUND), sensor).ranges
     elevation, azimuth = angles(sensor)
-    pitch = 0.8 * 0.1 * passed  # positive lowers the nose
-    down = elevation.cos() * azimuth.cos() * pitch.sin() - elevation.sin() * pitch.cos()
-    expected = (1.8 / down).where(down > 0.018, 0.0).float()
-    torch.testing.assert_close(found, expected, atol=5e-3, rtol=0)  # grazing rays of float32, up to 100 m
+    forward, left, up = elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()
+    tilt = 0.8 * 0.1 * passed  # pitch lowers the nose, roll raises the left side
+    for rates, rise in (((0, 0.8, 0), -forward), ((0.8, 0, 0), left)):
+        found = scan(Effects(angular_velocity=rates), plates(GROUND), sensor).ranges
+        down = -(rise * tilt.sin() + up * tilt.cos())
+        expected = (1.8 / down).where(down > 0.018, 0.0).float()
+        torch.testing.assert_close(found, expected, atol=5e-3, rtol=0)  # grazing rays of float32, up to 100 m
 
 
 # Bad input
