@@ -2,13 +2,13 @@
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch.utils.data import IterableDataset
+from torch.utils.data import IterableDataset, get_worker_info
 
 from ilnet import simulate, towns
 from ilnet.scan import Scan
@@ -40,40 +40,48 @@ class Batch(NamedTuple):
 class Street(NamedTuple):
     """A town ready for rays."""
 
+    town: towns.Town
     mesh: Mesh
-    waypoints: torch.Tensor
-    """(N, 3) metres, on the lanes."""
-    headings: torch.Tensor
-    """(N,) rad."""
+    """What stands in it."""
 
     def pose(self, number: int) -> torch.Tensor:
         """The pose (4, 4) of a sensor that looks ahead above waypoint `number`."""
-        return simulate.pose(self.waypoints[number] + torch.tensor([0, 0, SENSOR_HEIGHT]), self.headings[number])
+        x, y, z = self.town.waypoints[number].tolist()
+        return simulate.pose((x, y, z + SENSOR_HEIGHT), float(self.town.headings[number]))
+
+    def world(self, position: torch.Tensor, seed: int | Sequence[int]) -> list[Mesh]:
+        """What a sensor at a position (3,) [m] is surrounded by: the town, and traffic that the seed decides."""
+        vertices, triangles = towns.traffic(self.town, position.numpy(), seed)
+        return [self.mesh, Mesh(vertices, triangles, self.mesh.device)] if len(triangles) else [self.mesh]
 
 
-def street(name: str, seed: int, device: torch.device | str = "cpu") -> Street:
+def street(name: str, seed: int = 0, device: torch.device | str = "cpu") -> Street:
     """Builds a town and its ray casting mesh."""
     town = towns.build(name, seed)
-    return Street(
-        Mesh(town.vertices, town.triangles, device), torch.tensor(town.waypoints), torch.tensor(town.headings)
-    )
+    return Street(town, Mesh(town.vertices, town.triangles, device))
 
 
 def held_out_scans(street: Street, count: int, sensors: list[Sensor]) -> list[list[Scan]]:
-    """Simulates the same evenly spread waypoints of a town with each of several sensors.
+    """Simulates the same evenly spread waypoints of a town, each with its own traffic, with each of several sensors.
 
     Returns:
         For each waypoint one scan per sensor.
     """
-    chosen = torch.linspace(0, len(street.waypoints) - 1, count + 2)[1:-1].long().tolist()
-    return [[simulate.simulate(street.mesh, sensor, street.pose(i)) for sensor in sensors] for i in chosen]
+    scans = []
+    for number in torch.linspace(0, len(street.town.waypoints) - 1, count + 2)[1:-1].long().tolist():
+        pose = street.pose(number)
+        world = street.world(pose[:3, 3], number)
+        scans.append([simulate.simulate(world, sensor, pose) for sensor in sensors])
+    return scans
 
 
 class ContinuousRays(IterableDataset):
     """Endless batches of crops and of rays at random directions between their pixels.
 
-    Each crop has a street, a waypoint, a height, a yaw and a tilt of its own. A query's direction is uniform
-    in elevation and azimuth: no stored image contains it.
+    Each crop has a street, a waypoint, a height, a yaw, a tilt and traffic of its own. A query's direction is uniform
+    in elevation and azimuth: no stored image contains it. Rays are cast when a batch is asked for, where the streets
+    are: on a GPU, or on the CPU, where the workers of a `DataLoader` take turns. The batches are the same for any
+    number of workers.
 
     Args:
         streets: Where scans are taken; each is drawn equally often.
@@ -92,11 +100,14 @@ class ContinuousRays(IterableDataset):
         self.sensor = replace(sensor, azimuths=sensor.azimuths[:columns], name=f"{sensor.name} crop")
 
     def __iter__(self) -> Iterator[Batch]:
-        for number in itertools.count(self.start):
-            state = np.random.SeedSequence((self.seed, number)).generate_state(1, np.uint64)
-            yield self._draw(torch.Generator().manual_seed(int(state[0] >> 1)))
+        worker = get_worker_info()
+        first, step = (worker.id, worker.num_workers) if worker else (0, 1)
+        return map(self._draw, itertools.count(self.start + first, step))
 
-    def _draw(self, generator: torch.Generator) -> Batch:
+    def _draw(self, number: int) -> Batch:
+        state = np.random.SeedSequence((self.seed, number)).generate_state(1, np.uint64)
+        generator = torch.Generator().manual_seed(int(state[0] >> 1))
+
         def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
             return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
 
@@ -106,17 +117,47 @@ class ContinuousRays(IterableDataset):
         grid = sensor.directions().double().view(1, -1, 3).expand(crops, -1, -1)
         rays = torch.cat((grid, angles_to_directions(elevation, azimuth)), 1)
         town = torch.randint(len(self.streets), (crops,), generator=generator)
-        ranges = rays.new_empty(rays.shape[:2], dtype=torch.float32)
-        for number, street in enumerate(self.streets):
-            chosen = (town == number).nonzero().squeeze(1)
-            if len(chosen) == 0:
-                continue
-            at = street.waypoints[torch.randint(len(street.waypoints), (len(chosen),), generator=generator)].double()
-            at[:, 2] += SENSOR_HEIGHT + uniform(-_HEIGHT_JITTER, _HEIGHT_JITTER, len(chosen))
-            turn = uniform(-math.pi, math.pi, len(chosen))
-            tilt = uniform(-_TILT_JITTER, _TILT_JITTER, 2, len(chosen))
-            pose = simulate.pose(at, turn, *tilt)
-            ranges[chosen] = simulate.measure(street.mesh, sensor, pose, rays[chosen]).cpu()
-        ranges = ranges.where(ranges > 0, sensor.norm_range)
+        along = uniform(0, 1, crops)
+        at = torch.stack([self._waypoint(*place) for place in zip(town.tolist(), along.tolist(), strict=True)])
+        at[:, 2] += SENSOR_HEIGHT + uniform(-_HEIGHT_JITTER, _HEIGHT_JITTER, crops)
+        turn, tilt = uniform(-math.pi, math.pi, crops), uniform(-_TILT_JITTER, _TILT_JITTER, 2, crops)
+        pose = simulate.pose(at, turn, *tilt)
+        ranges = self._cast_traffic(town, pose, rays, number)
+        for which in town.unique().tolist():
+            chosen = town == which
+            standing = simulate.cast(self.streets[which].mesh, pose[chosen], rays[chosen], sensor.max_range)
+            ranges[chosen] = simulate.nearest([standing, ranges[chosen]])
+        ranges = ranges.where(ranges >= max(sensor.min_range, 1e-9), sensor.norm_range).cpu()
         image, ranges = ranges.split([grid.shape[1], self.queries], 1)
         return Batch(image.unflatten(1, sensor.shape), sensor.locate(elevation, azimuth), ranges.contiguous())
+
+    def _waypoint(self, town: int, along: float) -> torch.Tensor:
+        waypoints = self.streets[town].town.waypoints
+        return torch.from_numpy(waypoints[int(along * len(waypoints))]).double()
+
+    def _cast_traffic(self, town: torch.Tensor, pose: torch.Tensor, rays: torch.Tensor, number: int) -> torch.Tensor:
+        """Ranges (B, N) to the vehicles and people of each crop; 0 where none is met.
+
+        They are one mesh, in which the crops stand so far apart that none sees another's.
+        """
+        apart = torch.zeros(self.crops, 3, dtype=torch.float64)
+        apart[:, 0] = torch.arange(self.crops) * 4 * self.sensor.max_range
+        first, last = self.sensor.azimuths[[0, -1]]
+        middle = angles_to_directions(torch.tensor(0.0), torch.tensor((first + last) / 2)).double()
+        half = abs(last - first) / 2 + _TILT_JITTER
+        corners = [torch.empty(0, 3)]
+        for crop, which in enumerate(town.tolist()):
+            position, ahead = pose[crop, :3, 3].numpy(), pose[crop, :3, :3] @ middle
+            sector = math.atan2(ahead[1], ahead[0]), half
+            seed = self.seed, number, crop
+            vertices, triangles = towns.traffic(self.streets[which].town, position, seed, sector=sector)
+            moved = (vertices - position + apart[crop].numpy()).astype(np.float32)
+            corners.append(torch.from_numpy(moved[triangles.ravel()]))
+        joined = torch.cat(corners)
+        device = self.streets[0].mesh.device
+        if len(joined) == 0:
+            return torch.zeros(rays.shape[:2], device=device)
+        mesh = Mesh(joined, torch.arange(len(joined)).view(-1, 3), device)
+        pose = pose.clone()
+        pose[:, :3, 3] = apart
+        return simulate.cast(mesh, pose, rays, self.sensor.max_range)

@@ -21,14 +21,15 @@ TOWN = "town01"
 _WAYPOINT = 400
 
 
-def _pair(mesh: Mesh, pose: torch.Tensor) -> tuple[Scan, Scan]:
-    return simulate.simulate(mesh, INPUT, pose), simulate.simulate(mesh, OUTPUT, pose)
+def _pair(world: simulate.World, pose: torch.Tensor) -> tuple[Scan, Scan]:
+    return simulate.simulate(world, INPUT, pose), simulate.simulate(world, OUTPUT, pose)
 
 
 def from_town() -> tuple[Scan, Scan]:
     """A scan of 16×1024 in the embedded town, and what 128×2048 rays measure there."""
     street = data.street(TOWN, seed=0, device=simulate.best_device())
-    return _pair(street.mesh, street.pose(_WAYPOINT))
+    pose = street.pose(_WAYPOINT)
+    return _pair(street.world(pose[:3, 3], seed=0), pose)
 
 
 def from_mesh(path: Path, at: tuple[float, float, float]) -> tuple[Scan, Scan]:

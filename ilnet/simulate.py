@@ -1,15 +1,21 @@
 """A sensor, a pose and a mesh make a scan."""
 
+import math
+from collections.abc import Sequence
+
 import torch
 
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 from kernels import Mesh
 
-__all__ = ["best_device", "measure", "pose", "simulate"]
-
+__all__ = ["World", "best_device", "cast", "nearest", "pose", "ranges", "simulate"]
 
 Angle = float | torch.Tensor
+# One mesh or several: a town, and the traffic in it.
+World = Mesh | Sequence[Mesh]
+# On CUDA. They take about 200 bytes each on the way.
+_RAYS_AT_ONCE = 1 << 22
 
 
 def best_device() -> torch.device:
@@ -44,33 +50,69 @@ def pose(
     return torch.stack(entries, -1).unflatten(-1, (4, 4))
 
 
-def measure(mesh: Mesh, sensor: Sensor, pose: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
-    """Measures ranges along any directions, with the range limits of a sensor.
+def cast(mesh: Mesh, pose: torch.Tensor, directions: torch.Tensor, max_range: float) -> torch.Tensor:
+    """Casts rays along any directions.
 
     Args:
-        mesh: The world, in metres.
-        sensor: Whose limits hold.
-        pose: (..., 4, 4) transforms from the sensor frame to the world.
+        mesh: Metres.
+        pose: (..., 4, 4) transforms from the sensor frame to that of the mesh.
         directions: (..., N, 3) unit vectors in the sensor frame.
+        max_range: Metres.
 
     Returns:
-        (..., N) float32 metres on the mesh's device; 0 where nothing is met between minimum and maximum range.
+        (..., N) float32 metres on the mesh's device; 0 where nothing is met.
     """
     pose = pose.to(mesh.device)
     turned = directions.to(mesh.device).double() @ pose[..., :3, :3].mT
-    ranges = mesh.cast(pose[..., None, :3, 3], turned, sensor.max_range).range
-    return ranges.where(ranges >= sensor.min_range, 0.0)
+    return mesh.cast(pose[..., None, :3, 3], turned, max_range).range
 
 
-def simulate(mesh: Mesh, sensor: Sensor, pose: torch.Tensor) -> Scan:
-    """Casts every ray of a sensor at a mesh.
+def nearest(found: Sequence[torch.Tensor]) -> torch.Tensor:
+    """The nearest of several ranges of the same rays, 0 being none."""
+    ranges, *others = found
+    for other in others:
+        ranges = other.where((ranges == 0) | (other > 0) & (other < ranges), ranges)
+    return ranges
+
+
+def ranges(world: World, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
+    """Casts every ray of a sensor at each of several poses, by the engine that is faster for each mesh.
 
     Args:
-        mesh: The world, in metres.
+        world: Meshes, metres; what is nearest is measured.
+        sensor: Whose rays are cast.
+        poses: (..., 4, 4) transforms from the sensor frame to the world.
+
+    Returns:
+        (..., H, W) float32 metres on the meshes' device; 0 where nothing is met between minimum and maximum range.
+    """
+    meshes = [world] if isinstance(world, Mesh) else world
+    found = nearest([_images(mesh, sensor, poses.view(-1, 4, 4)) for mesh in meshes])
+    return found.where(found >= sensor.min_range, 0.0).view(*poses.shape[:-2], *sensor.shape)
+
+
+def _images(mesh: Mesh, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
+    """The ranges (N, H, W) of one mesh from poses (N, 4, 4)."""
+    tables = torch.tensor(sensor.elevations), torch.tensor(sensor.azimuths)
+    directions, rays = sensor.directions().view(-1, 3), math.prod(sensor.shape)
+    images = [torch.empty(0, *sensor.shape, device=mesh.device)]
+    for some in poses.split(1 if mesh.device.type == "cpu" else max(1, _RAYS_AT_ONCE // rays)):
+        if len(some) == 1 and mesh.projects_faster(some[0, :3, 3], rays, sensor.max_range):
+            images.append(mesh.project(some[0], *tables, sensor.max_range).unsqueeze(0))
+        else:
+            images.append(cast(mesh, some, directions, sensor.max_range).view(-1, *sensor.shape))
+    return torch.cat(images)
+
+
+def simulate(world: World, sensor: Sensor, pose: torch.Tensor) -> Scan:
+    """Casts every ray of a sensor.
+
+    Args:
+        world: Meshes, metres; what is nearest is measured.
         sensor: Whose rays are cast.
         pose: (4, 4) transform from the sensor frame to the world.
 
     Returns:
         The scan; 0 where nothing is met between the sensor's minimum and maximum range.
     """
-    return Scan(measure(mesh, sensor, pose, sensor.directions().view(-1, 3)).view(sensor.shape), sensor)
+    return Scan(ranges(world, sensor, pose), sensor)

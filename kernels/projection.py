@@ -6,25 +6,65 @@ them at
 
     ρ = (ρ₁ Δz - z₁ Δρ) / (Δz - m Δρ),    range = ρ √(1 + m²)
 
-exactly, without a tree over the triangles. The azimuths of a triangle's corners tell which columns to cut it with;
-columns are shared out in blocks, so that no two threads write to one.
+exactly, without a tree over the triangles. What cannot be seen is left out before that, coarse to fine: clusters of
+neighbouring triangles out of reach or above and below all rows, then triangles between two rows or two columns. Columns
+are shared out in blocks, so that no two threads write to one.
 """
+
+from typing import NamedTuple
 
 import torch
 import warp as wp
 
 from kernels.launch import launch
 
-__all__ = ["project_triangles"]
+__all__ = ["Clusters", "cluster_triangles", "project_triangles", "within_reach"]
 
-# Blocks of columns. Each looks at the columns of every triangle.
-_BLOCKS = 16
-# Radians that a triangle's columns are widened by: the cut decides, but float32 decides what is cut.
+# Triangles of a cluster.
+_SIZE = wp.constant(64)
+# Blocks of columns for each core. Each block looks at the columns of every triangle.
+_BLOCKS_PER_CORE = 8
+# Radians that a triangle's columns are widened by: the cut decides, but float32 decides what is cut. The same, as a
+# share of their slope, for its rows.
 _MARGIN = 1e-5
 # Metres from the vertical axis that a segment is cut off at, where it crosses the axis; and the least range.
 _NEAR = 1e-6
 
 _TURN = wp.constant(6.283185307179586)
+
+
+class Clusters(NamedTuple):
+    """Triangles in an order that keeps neighbours together, 64 to a cluster, and a ball around each cluster."""
+
+    corners: torch.Tensor
+    """(64 C, 3, 3) float32, metres; the last cluster is filled up with triangles of no size."""
+    centres: torch.Tensor
+    """(C, 3) float32, metres."""
+    radii: torch.Tensor
+    """(C,) float32, metres."""
+
+
+def cluster_triangles(vertices: torch.Tensor, triangles: torch.Tensor) -> Clusters:
+    """Sorts triangles along a space-filling curve and groups them.
+
+    Args:
+        vertices: (V, 3) float32, metres.
+        triangles: (F, 3) int32, numbers of the vertices.
+
+    Returns:
+        The clusters.
+    """
+    corners = vertices[triangles.long()]
+    middle = corners.mean(1)
+    cell = ((middle - middle.amin(0)) / (middle.amax(0) - middle.amin(0)).max().clamp(min=1e-6) * 1023).long()
+    for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):  # two zeros after every bit
+        cell = (cell | (cell << shift)) & mask
+    corners = corners[(cell << torch.arange(3, device=cell.device)).sum(1).argsort(stable=True)]
+    missing = -len(corners) % int(_SIZE)
+    corners = torch.cat((corners, corners[-1:, :1].expand(missing, 3, 3))).contiguous()
+    points = corners.view(-1, 3 * int(_SIZE), 3)
+    centres = (points.amin(1) + points.amax(1)) / 2
+    return Clusters(corners, centres, (points - centres.unsqueeze(1)).norm(dim=2).amax(1))
 
 
 @wp.func
@@ -41,37 +81,69 @@ def _lower_bound(table: wp.array[float], value: float):
     return begin
 
 
+@wp.func
+def _horizontal(a: wp.vec3):
+    """The distance of a point from the vertical axis."""
+    return wp.sqrt(a[0] * a[0] + a[1] * a[1])
+
+
+@wp.func
+def _between_rows(a: wp.vec3, b: wp.vec3, c: wp.vec3, edge: float, slopes: wp.array[float], margin: float):
+    """Whether no row can see a triangle, judged by bounds on its slopes."""
+    ra = _horizontal(a)
+    rb = _horizontal(b)
+    rc = _horizontal(c)
+    nearest = wp.min(ra, wp.min(rb, rc))
+    farthest = wp.max(ra, wp.max(rb, rc))
+    # No chord of length `edge` between points at least so far from the axis comes nearer.
+    inner = nearest * nearest - 0.25 * edge * edge
+    if inner <= 1.0e-3 * edge * edge:
+        return False
+    inner = wp.sqrt(inner)
+    low = wp.min(a[2], wp.min(b[2], c[2]))
+    high = wp.max(a[2], wp.max(b[2], c[2]))
+    low = wp.where(low < 0.0, low / inner, low / farthest)
+    high = wp.where(high > 0.0, high / inner, high / farthest)
+    row = _lower_bound(slopes, low - margin * (1.0 + wp.abs(low)))
+    if row == slopes.shape[0]:
+        return True
+    return slopes[row] > high + margin * (1.0 + wp.abs(high))
+
+
 @wp.kernel(enable_backward=False)
 def _find_columns_kernel(
     first: int,
     # in
-    corners: wp.array[wp.vec3],
-    angles: wp.array[float],
-    triangles: wp.array[wp.vec3i],
+    clusters: wp.array[wp.int32],
+    corners: wp.array2d[wp.vec3],
+    origin: wp.vec3,
+    rotation: wp.mat33,
     azimuths: wp.array[float],
+    slopes: wp.array[float],
     max_range: float,
     margin: float,
     # out
+    corners_out: wp.array2d[wp.vec3],
     columns_out: wp.array[wp.vec2i],
 ):
-    f = first + wp.tid()
-    t = triangles[f]
-    a = corners[t[0]]
-    b = corners[t[1]]
-    c = corners[t[2]]
+    i = first + wp.tid()
+    f = clusters[i // _SIZE] * _SIZE + i % _SIZE
+    a = rotation * (corners[f, 0] - origin)
+    b = rotation * (corners[f, 1] - origin)
+    c = rotation * (corners[f, 2] - origin)
     edge = wp.max(wp.length(b - a), wp.max(wp.length(c - b), wp.length(a - c)))
     nearest = wp.min(wp.length(a), wp.min(wp.length(b), wp.length(c)))
-    ab = a[0] * b[1] - a[1] * b[0]
-    bc = b[0] * c[1] - b[1] * c[0]
-    ca = c[0] * a[1] - c[1] * a[0]
     columns = wp.vec2i(0, 0)
-    if nearest - edge <= max_range:
+    if nearest - edge <= max_range and not _between_rows(a, b, c, edge, slopes, margin):
+        ab = a[0] * b[1] - a[1] * b[0]
+        bc = b[0] * c[1] - b[1] * c[0]
+        ca = c[0] * a[1] - c[1] * a[0]
         if (ab >= 0.0 and bc >= 0.0 and ca >= 0.0) or (ab <= 0.0 and bc <= 0.0 and ca <= 0.0):
             columns[1] = azimuths.shape[0]  # around the vertical axis
         else:
-            u = angles[t[0]]
-            v = angles[t[1]]
-            w = angles[t[2]]
+            u = wp.atan2(a[1], a[0])
+            v = wp.atan2(b[1], b[0])
+            w = wp.atan2(c[1], c[0])
             low = wp.min(u, wp.min(v, w))
             high = wp.max(u, wp.max(v, w))
             if high - low > 0.5 * _TURN:  # across ±π
@@ -90,7 +162,10 @@ def _find_columns_kernel(
             high = high - turns
             columns[0] = _lower_bound(azimuths, low)
             columns[1] = _lower_bound(azimuths, high) + _lower_bound(azimuths, high - _TURN) - columns[0]
-    columns_out[f] = columns
+    corners_out[i, 0] = a
+    corners_out[i, 1] = b
+    corners_out[i, 2] = c
+    columns_out[i] = columns
 
 
 @wp.func
@@ -172,8 +247,7 @@ def _cut(
 def _project_kernel(
     first: int,
     # in
-    corners: wp.array[wp.vec3],
-    triangles: wp.array[wp.vec3i],
+    corners: wp.array2d[wp.vec3],
     columns: wp.array[wp.vec2i],
     sines: wp.array[float],
     cosines: wp.array[float],
@@ -190,26 +264,26 @@ def _project_kernel(
     for column in range(begin, end):
         for row in range(slopes.shape[0]):
             ranges_out[column, row] = wp.inf
-    for f in range(triangles.shape[0]):
+    for f in range(columns.shape[0]):
         start = columns[f][0]
         stop = start + columns[f][1]
         if wp.min(stop, end) > wp.max(start, begin) or stop - width > begin:
-            t = triangles[f]
             for column in range(wp.max(start, begin), wp.min(stop, end)):
                 _cut(
-                    corners[t[0]], corners[t[1]], corners[t[2]], sines[column], cosines[column], slopes,
+                    corners[f, 0], corners[f, 1], corners[f, 2], sines[column], cosines[column], slopes,
                     max_range, near, column, ranges_out,
                 )  # fmt: skip
             for column in range(begin, wp.min(stop - width, end)):
                 _cut(
-                    corners[t[0]], corners[t[1]], corners[t[2]], sines[column], cosines[column], slopes,
+                    corners[f, 0], corners[f, 1], corners[f, 2], sines[column], cosines[column], slopes,
                     max_range, near, column, ranges_out,
                 )  # fmt: skip
 
 
 def project_triangles(
-    corners: torch.Tensor,
-    triangles: torch.Tensor,
+    clusters: Clusters,
+    origin: torch.Tensor,
+    rotation: torch.Tensor,
     elevations: torch.Tensor,
     azimuths: torch.Tensor,
     max_range: float,
@@ -217,8 +291,9 @@ def project_triangles(
     """Finds the range of the nearest triangle along each ray of a range image.
 
     Args:
-        corners: (V, 3) float32, metres, in the frame of the sensor, which stands at its origin.
-        triangles: (F, 3) int32, numbers of the corners.
+        clusters: The triangles, metres, in the frame of the mesh.
+        origin: (3,) metres, of the sensor in that frame.
+        rotation: (3, 3) from the sensor's axes to those of that frame.
         elevations: (H,) rad, of the rows, within ±90 degrees.
         azimuths: (W,) rad, of the columns, all different, within one turn.
         max_range: Metres; farther surfaces are not seen.
@@ -226,18 +301,43 @@ def project_triangles(
     Returns:
         (H, W) float32 metres; 0 where nothing is met.
     """
-    device = corners.device
+    device = clusters.corners.device
     azimuths, column_order = azimuths.to(device).double().sort()
     slopes, row_order = elevations.to(device).double().tan().float().sort()
-    columns = torch.empty(len(triangles), 2, dtype=torch.int32, device=device)
-    angles = torch.atan2(corners[:, 1], corners[:, 0])
-    inputs = [corners.contiguous(), angles, triangles, azimuths.float(), max_range, _MARGIN]
-    launch(_find_columns_kernel, len(triangles), inputs, [columns])
+    seen = _seen(clusters, origin, rotation, elevations, max_range)
+    corners = torch.empty(len(seen) * int(_SIZE), 3, 3, device=device)
+    columns = torch.empty(len(corners), 2, dtype=torch.int32, device=device)
+    placement = [wp.vec3(*origin.tolist()), wp.mat33(*rotation.T.flatten().tolist())]
+    inputs = [seen, clusters.corners, *placement, azimuths.float(), slopes, max_range, _MARGIN]
+    launch(_find_columns_kernel, len(corners), inputs, [corners, columns])
     ranges = torch.empty(len(azimuths), len(slopes), device=device)
     tables = [azimuths.sin().float(), azimuths.cos().float(), slopes]
-    span = -(-len(azimuths) // _BLOCKS)
-    inputs = [corners.contiguous(), triangles, columns, *tables, max_range, _NEAR, span]
+    blocks = _BLOCKS_PER_CORE * torch.get_num_threads() if device.type == "cpu" else len(azimuths)
+    span = -(-len(azimuths) // blocks)
+    inputs = [corners, columns, *tables, max_range, _NEAR, span]
     launch(_project_kernel, -(-len(azimuths) // span), inputs, [ranges], least=1)
     image = torch.empty_like(ranges.T).contiguous()
     image[row_order.unsqueeze(1), column_order] = ranges.T
     return image.masked_fill_(image.isinf(), 0.0)
+
+
+def within_reach(clusters: Clusters, origin: torch.Tensor, max_range: float) -> int:
+    """Counts the triangles of the clusters that begin within `max_range` [m] of an origin (3,) [m]."""
+    distance = (clusters.centres - origin.float()).norm(dim=1)
+    return int((distance - clusters.radii <= max_range).sum()) * int(_SIZE)
+
+
+def _seen(
+    clusters: Clusters, origin: torch.Tensor, rotation: torch.Tensor, elevations: torch.Tensor, max_range: float
+) -> torch.Tensor:
+    """Numbers (K,) int32 of the clusters within reach and between the highest and the lowest row, nearest first."""
+    away = clusters.centres - origin.float()
+    distance = away.norm(dim=1)
+    height = away @ rotation[:, 2].float()
+    elevation = torch.asin((height / distance.clamp(min=1e-6)).clamp(-1, 1))
+    width = torch.asin((clusters.radii / distance.clamp(min=1e-6)).clamp(max=1)) + 1e-4
+    width.masked_fill_(distance <= clusters.radii, torch.inf)
+    low, high = float(elevations.min()), float(elevations.max())
+    seen = (distance - clusters.radii <= max_range) & (elevation + width >= low) & (elevation - width <= high)
+    numbers = seen.nonzero().squeeze(1)
+    return numbers[distance[numbers].argsort()].int()

@@ -1,5 +1,6 @@
 """A mesh and its rays: nearest hits through Warp's bounding volume hierarchy, one thread a ray."""
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -9,12 +10,14 @@ import warp as wp
 from kernels import reference
 from kernels.launch import check_backend, check_floating, initialise, launch
 from kernels.neighbours import broadcast_batch
-from kernels.projection import project_triangles
+from kernels.projection import Clusters, cluster_triangles, project_triangles, within_reach
 
 __all__ = ["Hits", "Mesh"]
 
 # Metres. A nearer hit is reported at this range, since 0 means none.
 _LEAST_RANGE = 1e-6
+# Rays that are cast one by one in the time that a projection takes to begin.
+_FEW_RAYS = 3000
 
 
 class Hits(NamedTuple):
@@ -107,14 +110,24 @@ class Mesh:
         self._middle = ((points.amin(0) + points.amax(0)).double() / 2).round().to(self.device)
         self._vertices = (points.to(self.device).double() - self._middle).float()
         self._triangles = faces.to(self.device, torch.int32).contiguous()
+
+    # Made when they are first asked for: few meshes need both.
+
+    @cached_property
+    def _tree(self) -> wp.Mesh:
         if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)  # the copies ran on torch's stream, and the mesh is built on Warp's
-        self._mesh = wp.Mesh(
+            torch.cuda.synchronize(self.device)  # the copies ran on torch's stream, and the tree is built on Warp's
+        tree = wp.Mesh(
             points=wp.from_torch(self._vertices, dtype=wp.vec3),
             indices=wp.from_torch(self._triangles.view(-1), dtype=wp.int32),
         )
         if self.device.type == "cuda":
             wp.synchronize_device(str(self.device))  # and used on torch's again
+        return tree
+
+    @cached_property
+    def _clusters(self) -> Clusters:
+        return cluster_triangles(self._vertices, self._triangles)
 
     def cast(self, origins: torch.Tensor, directions: torch.Tensor, max_range: float, backend: str = "warp") -> Hits:
         """Finds the nearest hit of each ray.
@@ -163,7 +176,7 @@ class Mesh:
             ranges = origins.new_empty(len(origins))
             triangles = torch.empty_like(ranges, dtype=torch.int32)
             cosines = torch.empty_like(ranges)
-            inputs = [self._mesh.id, origins, directions, float(max_range)]
+            inputs = [self._tree.id, origins, directions, float(max_range)]
             launch(_cast_rays_kernel, len(origins), inputs, [ranges, triangles, cosines])
         return Hits(ranges.view(batch), triangles.view(batch), cosines.view(batch))
 
@@ -172,8 +185,8 @@ class Mesh:
     ) -> torch.Tensor:
         """Finds the range along each ray of a range image, whose rays all start at one point, without walking a tree.
 
-        The same ranges as `cast` gives, but for rays that graze an edge. The time hardly grows with the number of rays:
-        on a CPU faster than `cast` for more than some hundred thousand in a mesh of half a million triangles.
+        The same ranges as `cast` gives, but for rays that graze an edge. The time grows with the triangles within
+        reach, and hardly with the number of rays; see `projects_faster`.
 
         Args:
             pose: (4, 4) transform from the sensor frame to that of the vertices, a rotation and a translation [m].
@@ -195,5 +208,20 @@ class Mesh:
         if not max_range > 0:
             raise ValueError(f"max_range is {max_range}; it should be a number of metres above 0")
         pose = pose.to(self.device).double()
-        corners = (self._vertices - (pose[:3, 3] - self._middle).float()) @ pose[:3, :3].float()
-        return project_triangles(corners, self._triangles, elevations, azimuths, float(max_range))
+        origin, rotation = pose[:3, 3] - self._middle, pose[:3, :3]
+        return project_triangles(self._clusters, origin, rotation, elevations, azimuths, float(max_range))
+
+    def projects_faster(self, position: torch.Tensor, rays: int, max_range: float) -> bool:
+        """Tells whether `project` finds the ranges of so many rays from a position sooner than `cast`.
+
+        Args:
+            position: (3,) metres, in the frame of the vertices.
+            rays: Their number.
+            max_range: Metres, of the rays.
+
+        Returns:
+            False on CUDA. On a CPU a ray of `cast` takes as long as about four triangles within reach of `project`.
+        """
+        if self.device.type != "cpu":
+            return False
+        return rays > _FEW_RAYS + within_reach(self._clusters, position - self._middle, max_range) / 4

@@ -2,8 +2,9 @@
 
 from ilnet.towns.town import Town
 from ilnet.towns.town01 import plan as _town01
+from ilnet.towns.traffic import traffic
 
-__all__ = ["NAMES", "Town", "build"]
+__all__ = ["NAMES", "Town", "build", "traffic"]
 
 _PLANS = {"town01": _town01}
 NAMES = tuple(_PLANS)

@@ -1,13 +1,13 @@
-"""What lines the streets and stands on them: lamps, trees, signs, parked cars, traffic, people, wires."""
+"""What lines the streets and stands on them: lamps, trees, signs, wires, and where one may park and walk."""
 
 import numpy as np
 
-from ilnet.towns import furniture, plants, vehicles
+from ilnet.towns import furniture, plants
 from ilnet.towns.parts import Part
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Street
 
-__all__ = ["dress_street", "greenery", "plant_fields", "signals", "traffic"]
+__all__ = ["dress_street", "greenery", "plant_fields", "signals"]
 
 
 def greenery(rng: np.random.Generator) -> dict[str, list[Part]]:
@@ -66,27 +66,16 @@ def dress_street(site: Site, street: Street, greens: dict[str, list[Part]], rng:
         wide = side * (street.half + street.pavement - 0.5)
         if not open_country:
             stand([furniture.bin_(False), furniture.bin_(True)], 20, 35, 0.6, wide, inward)
-            people = [furniture.pedestrian(a, b) for a, b in ((0.7, 0.25), (0.5, 0.15), (0.1, 0.05))]
-            for turn in (0.0, np.pi):
-                stand(
-                    people,
-                    6,
-                    26,
-                    0.3,
-                    side * (street.half + rng.uniform(0.9, street.pavement - 0.4)),
-                    turn,
-                    (0.85, 1.08),
-                )
+            _walks(site, street, side, rng)
         if street.frontage in ("shops", "towers"):
             stand([furniture.bench()], 16, 41, 0.7, wide, inward)
             stand([furniture.bollard()], 3, 2.2, 0.25, offset, 0.0)
-            stand([vehicles.bicycle()], 12, 9, 0.25, wide, np.pi / 2)
             stand([furniture.bus_shelter()], 45, 150, 1.0, wide, inward)
         if street.pavement > 2.4:
             trees = greens["tall"] * 3 + greens["bare"]
             stand(trees, 7, rng.uniform(12, 18), 0.75, side * (street.half + 0.9), rng.uniform(0, 6), (0.95, 1.15))
         if street.parking:
-            _park(site, street, side, rng)
+            _parking(site, street, side, rng)
     if street.median:
         s = np.arange(4, street.length - 4, 2.0)
         xy, _ = street.at(s, 0.0)
@@ -101,39 +90,26 @@ def dress_street(site: Site, street: Street, greens: dict[str, list[Part]], rng:
         _power_line(site, street, rng)
 
 
-def _park(site: Site, street: Street, side: int, rng: np.random.Generator) -> None:
-    """Cars and vans along one kerb."""
+def _parking(site: Site, street: Street, side: int, rng: np.random.Generator) -> None:
+    """Places for cars along one kerb."""
     s = np.arange(5, street.length - 5, 6.1) + rng.uniform(-0.4, 0.4)
     lateral = side * (street.half - 1.08)
     xy, heading = street.at(s, lateral)
-    busy = rng.random(len(s)) < rng.uniform(0.18, 0.36)
+    straight = np.ones(len(s), dtype=bool)
     for step in (-6.0, -3.0, 0.0, 3.0, 6.0):  # no parking where the kerb turns away: junctions and the ends of streets
         near, _ = street.at(s + step, lateral)
-        busy &= np.abs(site.ground.edge(near) + 1.08) < 0.3
-    kind = rng.choice(5, len(s), p=[0.36, 0.27, 0.22, 0.11, 0.04])
-    fleet = [vehicles.car(0), vehicles.car(1), vehicles.car(2), vehicles.van(), vehicles.bicycle()]
-    turn = np.where(rng.random(len(s)) < 0.85, 0.0, np.pi) + (0.0 if side > 0 else np.pi) + rng.normal(0, 0.02, len(s))
-    scale = rng.uniform(0.95, 1.05, (len(s), 3)) * (1, 1, 1)
-    for k, part in enumerate(fleet):
-        pick = busy & (kind == k)
-        site.put(part, xy[pick], heading[pick] + turn[pick], scale[pick])
+        straight &= np.abs(site.ground.edge(near) + 1.08) < 0.3
+    turn = (0.0 if side > 0 else np.pi) + rng.normal(0, 0.02, len(s))
+    site.park(xy[straight], (heading + turn)[straight])
 
 
-def traffic(site: Site, street: Street, share: float, rng: np.random.Generator) -> np.ndarray:
-    """Vehicles standing in the lanes; returns points (N, 2) along their middles, metres."""
-    fleet = [vehicles.car(0), vehicles.car(1), vehicles.car(2), vehicles.van(), vehicles.lorry()]
-    centres = []
-    for lane in street.lanes:
-        for way in (1, -1):
-            s = np.arange(20, street.length - 20, 24.0)
-            s = s[rng.random(len(s)) < share] + rng.uniform(-4, 4)
-            xy, heading = street.at(s, way * lane)
-            for at, yaw in zip(xy, heading, strict=True):
-                kind = int(rng.choice(5, p=[0.3, 0.25, 0.2, 0.15, 0.1]))
-                site.put(fleet[kind], at, yaw if way > 0 else yaw + np.pi)
-                reach = 2.8 if kind == 4 else 0.0
-                centres += [at + step * np.array([np.cos(yaw), np.sin(yaw)]) for step in (-reach, 0.0, reach)]
-    return np.array(centres).reshape(-1, 2)
+def _walks(site: Site, street: Street, side: int, rng: np.random.Generator) -> None:
+    """Places for people on one pavement, where nothing stands in their way."""
+    s = np.arange(3, street.length - 3, 4.0) + rng.uniform(-1.5, 1.5, len(np.arange(3, street.length - 3, 4.0)))
+    xy, heading = street.at(s, side * (street.half + rng.uniform(0.95, max(street.pavement - 0.75, 1.0), len(s))))
+    edge = site.ground.edge(xy)
+    clear = (edge > 0.5) & (edge < street.pavement) & ~site.taken(xy)
+    site.walk(xy[clear], (heading + np.pi * rng.integers(0, 2, len(s)))[clear])
 
 
 def signals(site: Site, first: Street, second: Street) -> None:

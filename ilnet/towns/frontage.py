@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ilnet.towns import buildings, furniture, plants, vehicles
+from ilnet.towns import buildings, furniture, plants
 from ilnet.towns.parts import Part, boxes
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Street
@@ -43,7 +43,7 @@ def _boundary(rng: np.random.Generator) -> tuple[Part, float] | None:
 def _garden(
     site: Site, lot: Lot, width: float, setback: float, depth: float, greens: dict[str, list[Part]], rng
 ) -> None:
-    """Front edge with a gap for the door and the drive, side edges, plants, a parked car, bins."""
+    """Front edge with a gap for the door and the drive, side edges, plants, a place for a car, bins."""
     half = width / 2
     front = -setback + 0.25
     edge = _boundary(rng)
@@ -58,9 +58,7 @@ def _garden(
     if drive and setback > 4:
         y = -setback / 2 + rng.uniform(-0.2, 1.5)
         if site.free(lot.world([[half - 1.6, y - 2.2], [half - 1.6, y], [half - 1.6, y + 2.2]]), 0.9):
-            kind = int(rng.integers(0, 3))
-            spot = lot.world([half - 1.6, y])
-            site.put(vehicles.car(kind), spot, lot.yaw + np.pi / 2 + np.pi * int(rng.integers(0, 2)))
+            site.park(lot.world([half - 1.6, y]), lot.yaw + np.pi / 2 + np.pi * int(rng.integers(0, 2)))
     for _ in range(int(rng.integers(1, 5))):
         spot = lot.world([rng.uniform(-half, half - 3.5), rng.uniform(front + 0.6, -0.6)])
         bush = greens["bush"][int(rng.integers(0, len(greens["bush"])))]

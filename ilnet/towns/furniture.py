@@ -11,7 +11,6 @@ __all__ = [
     "bus_shelter",
     "fence",
     "lamp",
-    "pedestrian",
     "pole",
     "railing",
     "sign",
@@ -159,40 +158,3 @@ def bus_shelter() -> Part:
         0.04,
     )
     return merge([glass, roof, posts, boxes([-0.55, -1.3, 0.4], [-0.2, 1.3, 0.46])])
-
-
-def pedestrian(stride: float, swing: float, height: float = 1.75) -> Part:
-    """A walker facing +x.
-
-    Args:
-        stride: from foot to foot, metres.
-        swing: how far the hands swing, metres.
-        height: metres.
-    """
-    start = [[0, -0.1, 0.88], [0, 0.1, 0.88], [stride / 4, -0.1, 0.46], [-stride / 5, 0.1, 0.46]]
-    end = [[stride / 4, -0.1, 0.46], [-stride / 5, 0.1, 0.46], [stride / 2, -0.1, 0.03], [-stride / 2, 0.1, 0.06]]
-    start += [[0, -0.22, 1.42], [0, 0.22, 1.42], [-swing / 3, -0.26, 1.12], [swing / 3, 0.26, 1.12]]
-    end += [[-swing / 3, -0.26, 1.12], [swing / 3, 0.26, 1.12], [-swing / 2, -0.25, 0.85], [swing, 0.25, 0.9]]
-    limbs = tubes(
-        start,
-        end,
-        [0.09, 0.09, 0.065, 0.065, 0.06, 0.06, 0.045, 0.045],
-        [0.065, 0.065, 0.05, 0.05, 0.045, 0.045, 0.04, 0.04],
-        sides=5,
-        caps=False,
-    )
-    feet = boxes(
-        [[stride / 2 - 0.08, -0.15, 0], [-stride / 2 - 0.08, 0.05, 0]],
-        [[stride / 2 + 0.2, -0.05, 0.08], [-stride / 2 + 0.2, 0.15, 0.08]],
-    )
-    torso = tubes([[0, 0, 0.85], [0, 0, 1.1]], [[0, 0, 1.1], [0, 0, 1.48]], [0.17, 0.16], [0.16, 0.2], sides=8)
-    torso.vertices[:, 0] *= 0.7
-    head = tubes(
-        [[0, 0, 1.46], [0.01, 0, 1.53], [0.01, 0, 1.66]],
-        [[0, 0, 1.53], [0.01, 0, 1.66], [0, 0, 1.75]],
-        [0.06, 0.09, 0.1],
-        [0.06, 0.1, 0.05],
-        sides=7,
-    )
-    body = merge([limbs, feet, torso, head])
-    return Part(body.vertices * (height / 1.75), body.triangles)

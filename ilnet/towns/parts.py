@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["EMPTY", "Part", "boxes", "loft", "merge", "place", "polyline_tubes", "quads", "shift", "tubes"]
+__all__ = ["EMPTY", "Part", "boxes", "loft", "merge", "place", "polyline_tubes", "quads", "raster", "shift", "tubes"]
 
 
 class Part(NamedTuple):
@@ -136,3 +136,8 @@ def loft(rings: np.ndarray) -> Part:
     fan = np.stack([np.zeros_like(i), i, i + 1], axis=1)
     faces = [np.stack([a, b, b + k], 1), np.stack([a, b + k, a + k], 1), fan[:, ::-1], fan + (m - 1) * k]
     return Part(rings.reshape(-1, 3).astype(np.float64), np.concatenate(faces))
+
+
+def raster(metres: np.ndarray) -> np.ndarray:
+    """Returns an array rounded to 1/1024 and as float32, so that machines which differ in last digits agree."""
+    return (np.round(metres * 1024) / 1024).astype(np.float32)

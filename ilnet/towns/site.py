@@ -5,8 +5,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ilnet.towns.parts import Part, merge, place
+from ilnet.towns.parts import Part, merge, place, raster
 from ilnet.towns.streets import Ground
+from ilnet.towns.town import Town, lanes
 
 __all__ = ["Site"]
 
@@ -19,6 +20,8 @@ class Site:
         self.ground = ground
         self._parts = [ground.mesh()]
         self._taken = np.zeros((2 * ground.extent + 1,) * 2, dtype=bool)
+        self._parking: list[np.ndarray] = []
+        self._walks: list[np.ndarray] = []
 
     def put(self, part: Part, xy: ArrayLike, yaw: ArrayLike = 0.0, scale: ArrayLike = 1.0) -> None:
         """Set a part on the ground at each of xy (N, 2) or (2,); yaw in rad, scale as in `place`."""
@@ -29,6 +32,19 @@ class Site:
     def put_at(self, part: Part, position: ArrayLike, yaw: ArrayLike = 0.0) -> None:
         """Set a part at positions (N, 3) or (3,), whatever the ground."""
         self._parts.append(place(part, position, yaw))
+
+    def park(self, xy: ArrayLike, heading: ArrayLike) -> None:
+        """Offer places at xy (N, 2) or (2,) where a car may stand; heading in rad."""
+        self._parking.append(self._spots(xy, heading))
+
+    def walk(self, xy: ArrayLike, heading: ArrayLike) -> None:
+        """Offer places at xy (N, 2) or (2,) where somebody may walk or stand; heading in rad."""
+        self._walks.append(self._spots(xy, heading))
+
+    def _spots(self, xy: ArrayLike, heading: ArrayLike) -> np.ndarray:
+        """Rows (N, 4) of x, y, z and heading on the ground."""
+        position = self.ground.surface(np.asarray(xy, dtype=np.float64).reshape(-1, 2))
+        return np.column_stack([position, np.broadcast_to(heading, len(position))])
 
     def run(self, panel: Part, panel_length: float, path: ArrayLike) -> None:
         """Repeat a panel that runs along +x from its origin along a path (N, 2), off the carriageways."""
@@ -69,10 +85,17 @@ class Site:
         i, j = np.clip(np.round(points).astype(int) + self.ground.extent, 0, len(self._taken) - 1).T
         self._taken[i, j] = True
 
-    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+    def town(self, name: str, seed: int) -> Town:
+        """Returns what has been built."""
+        vertices, triangles = self._mesh()
+        waypoints, headings = lanes(self.ground)
+        parking, walks = (raster(np.concatenate([np.zeros((0, 4)), *spots])) for spots in (self._parking, self._walks))
+        return Town(name, seed, vertices, triangles, waypoints, headings, parking, walks)
+
+    def _mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (V, 3) float32 on a 1/1024 m raster and triangles (F, 3) int32 without slivers."""
         whole = merge(self._parts)
-        vertices = (np.round(whole.vertices * 1024) / 1024).astype(np.float32)
+        vertices = raster(whole.vertices)
         a, b, c = (vertices[whole.triangles[:, k]].astype(np.float64) for k in range(3))
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
         return vertices, whole.triangles[area > 1e-6].astype(np.int32)

@@ -4,17 +4,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ilnet.towns.parts import raster
 from ilnet.towns.streets import Ground
 
 __all__ = ["Town", "lanes"]
 
 _STEP = 1.8
-_TRAFFIC_GAP = 4.0
 
 
 @dataclass(frozen=True)
 class Town:
-    """A town's mesh and the lanes through it, x east, y north, z up.
+    """A town's mesh, the lanes through it and the places for what moves, x east, y north, z up.
+
+    The mesh holds what stands; `ilnet.towns.traffic` adds vehicles and people, anew for each scan.
 
     Attributes:
         name: which plan it follows.
@@ -23,6 +25,8 @@ class Town:
         triangles: (F, 3) int32.
         waypoints: (N, 3) float32 points on the lanes, 1.8 m apart, metres.
         headings: (N,) float32 driving direction, rad counter-clockwise from +x.
+        parking: (P, 4) float32 places where a car may stand: x, y, z [m] and heading [rad].
+        walks: (Q, 4) float32 places where somebody may walk or stand, or a bicycle: x, y, z [m] and heading [rad].
     """
 
     name: str
@@ -31,15 +35,12 @@ class Town:
     triangles: np.ndarray
     waypoints: np.ndarray
     headings: np.ndarray
+    parking: np.ndarray
+    walks: np.ndarray
 
 
-def lanes(ground: Ground, traffic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Waypoints (N, 3) float32 [m] and headings (N,) float32 [rad] of all lanes.
-
-    Args:
-        ground: the streets.
-        traffic: (M, 2) centres of vehicles standing in lanes, metres; no waypoint lies within 4 m of them.
-    """
+def lanes(ground: Ground) -> tuple[np.ndarray, np.ndarray]:
+    """Waypoints (N, 3) float32 [m] and headings (N,) float32 [rad] of all lanes."""
     points, headings = [], []
     for street in ground.streets:
         for lane in street.lanes:
@@ -51,9 +52,7 @@ def lanes(ground: Ground, traffic: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
                 s = np.interp(np.arange(0, driven[-1], _STEP), driven, s)[::way]
                 xy, heading = street.at(s, way * lane)
                 clear = ground.edge(xy) < -1.2
-                if len(traffic):
-                    clear &= np.linalg.norm(xy[:, None] - traffic, axis=-1).min(1) > _TRAFFIC_GAP
                 points.append(np.column_stack([xy, ground.height(xy)])[clear])
                 headings.append((heading if way > 0 else heading + np.pi)[clear])
     turned = np.mod(np.concatenate(headings) + np.pi, 2 * np.pi) - np.pi
-    return (np.round(np.concatenate(points) * 1024) / 1024).astype(np.float32), turned.astype(np.float32)
+    return raster(np.concatenate(points)), turned.astype(np.float32)

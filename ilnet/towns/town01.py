@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from ilnet.towns.dressing import dress_street, greenery, plant_fields, signals, traffic
+from ilnet.towns.dressing import dress_street, greenery, plant_fields, signals
 from ilnet.towns.frontage import build_lots
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Ground, Street, spline
-from ilnet.towns.town import Town, lanes
+from ilnet.towns.town import Town
 
 __all__ = ["plan"]
 
@@ -67,13 +67,10 @@ def plan(seed: int) -> Town:
     for street in streets:
         for side in (1, -1):
             build_lots(site, street, side, greens, rng)
-    busy = [traffic(site, street, 0.14, rng) for street in streets]
     for street in streets:
         dress_street(site, street, greens, rng)
     avenue, market, east = streets[:3]
     for other in (market, east):
         signals(site, avenue, other)
     plant_fields(site, greens, reach + 40, rng)
-    vertices, triangles = site.mesh()
-    waypoints, headings = lanes(site.ground, np.concatenate(busy))
-    return Town("town01", seed, vertices, triangles, waypoints, headings)
+    return site.town("town01", seed)

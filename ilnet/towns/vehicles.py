@@ -1,4 +1,4 @@
-"""Cars, vans, lorries, bicycles. Prototypes stand at the origin, wheels on z = 0, facing +x, metres."""
+"""Cars, vans, lorries, bicycles, people. Prototypes stand at the origin on z = 0, facing +x, metres."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from ilnet.towns.parts import Part, boxes, loft, merge, polyline_tubes, shift, tubes
 
-__all__ = ["bicycle", "car", "lorry", "van"]
+__all__ = ["bicycle", "car", "cyclist", "lorry", "pedestrian", "van"]
 
 # from the tail to the nose: x, belt height, roof or bonnet height, half width at the belt, half width at the top
 _HATCHBACK = [
@@ -156,3 +156,58 @@ def bicycle() -> Part:
     bars = tubes([[0.53, 0, 0.34], [0.34, -0.28, 1.0]], [[0.36, 0, 1.0], [0.34, 0.28, 1.0]], 0.018)
     saddle = boxes([-0.38, -0.07, 0.9], [-0.14, 0.07, 0.96])
     return merge([*rims, tubes(start, end, 0.02, caps=False), bars, saddle])
+
+
+def cyclist() -> Part:
+    """A rider on a bicycle."""
+    hip, shoulder, hand = np.array([-0.2, 0.0, 0.98]), np.array([0.1, 0.0, 1.45]), np.array([0.34, 0.0, 1.0])
+    side = np.array([[0.0, -0.1, 0.0], [0.0, 0.1, 0.0]])
+    knee, foot = np.array([[0.18, 0.0, 0.78], [0.1, 0.0, 0.62]]), np.array([[0.02, 0.0, 0.42], [-0.12, 0.0, 0.15]])
+    limbs = tubes(
+        np.concatenate([hip + side, knee + side, shoulder + 1.9 * side]),
+        np.concatenate([knee + side, foot + side, hand + 2.6 * side]),
+        np.repeat([0.09, 0.06, 0.05], 2),
+        np.repeat([0.065, 0.045, 0.04], 2),
+        sides=5,
+        caps=False,
+    )
+    torso = tubes(hip, shoulder, 0.15, 0.19, sides=7)
+    head = tubes([0.16, 0, 1.52], [0.18, 0, 1.76], 0.09, 0.08, sides=7)
+    return merge([bicycle(), limbs, torso, head])
+
+
+def pedestrian(stride: float, swing: float, height: float = 1.75) -> Part:
+    """A walker facing +x.
+
+    Args:
+        stride: from foot to foot, metres.
+        swing: how far the hands swing, metres.
+        height: metres.
+    """
+    start = [[0, -0.1, 0.88], [0, 0.1, 0.88], [stride / 4, -0.1, 0.46], [-stride / 5, 0.1, 0.46]]
+    end = [[stride / 4, -0.1, 0.46], [-stride / 5, 0.1, 0.46], [stride / 2, -0.1, 0.03], [-stride / 2, 0.1, 0.06]]
+    start += [[0, -0.22, 1.42], [0, 0.22, 1.42], [-swing / 3, -0.26, 1.12], [swing / 3, 0.26, 1.12]]
+    end += [[-swing / 3, -0.26, 1.12], [swing / 3, 0.26, 1.12], [-swing / 2, -0.25, 0.85], [swing, 0.25, 0.9]]
+    limbs = tubes(
+        start,
+        end,
+        [0.09, 0.09, 0.065, 0.065, 0.06, 0.06, 0.045, 0.045],
+        [0.065, 0.065, 0.05, 0.05, 0.045, 0.045, 0.04, 0.04],
+        sides=5,
+        caps=False,
+    )
+    feet = boxes(
+        [[stride / 2 - 0.08, -0.15, 0], [-stride / 2 - 0.08, 0.05, 0]],
+        [[stride / 2 + 0.2, -0.05, 0.08], [-stride / 2 + 0.2, 0.15, 0.08]],
+    )
+    torso = tubes([[0, 0, 0.85], [0, 0, 1.1]], [[0, 0, 1.1], [0, 0, 1.48]], [0.17, 0.16], [0.16, 0.2], sides=8)
+    torso.vertices[:, 0] *= 0.7
+    head = tubes(
+        [[0, 0, 1.46], [0.01, 0, 1.53], [0.01, 0, 1.66]],
+        [[0, 0, 1.53], [0.01, 0, 1.66], [0, 0, 1.75]],
+        [0.06, 0.09, 0.1],
+        [0.06, 0.1, 0.05],
+        sides=7,
+    )
+    body = merge([limbs, feet, torso, head])
+    return Part(body.vertices * (height / 1.75), body.triangles)

@@ -1,6 +1,8 @@
+import numpy as np
 import pytest
 import torch
 
+from ilnet import data, towns
 from kernels import Mesh
 
 
@@ -23,5 +25,24 @@ def yard_triangles():
 
 
 @pytest.fixture(scope="session")
-def yard():
-    return Mesh(*yard_triangles())
+def yard_on():
+    return lambda device: Mesh(*yard_triangles(), device)
+
+
+@pytest.fixture(scope="session")
+def yard(yard_on):
+    return yard_on("cpu")
+
+
+@pytest.fixture(scope="session")
+def quiet_street():
+    """Makes a street of a mesh and waypoints too far from each other for traffic: nobody parks or walks there."""
+
+    def make(mesh, waypoints):
+        waypoints = np.asarray(waypoints, np.float32)
+        nobody = np.zeros((0, 4), np.float32)
+        headings = np.zeros(len(waypoints), np.float32)
+        town = towns.Town("yard", 0, np.zeros((0, 3)), np.zeros((0, 3)), waypoints, headings, nobody, nobody)
+        return data.Street(town, mesh)
+
+    return make

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from ilnet.sensor import Sensor, preset
-from ilnet.simulate import pose, simulate
+from ilnet.simulate import pose, ranges, simulate
+from kernels import Mesh
 
 # float32 of coordinates up to 100 m.
 METRES = 1e-3
@@ -66,3 +67,49 @@ def test_presets_scan_the_yard(yard, size):
     scan = simulate(yard, preset(size), pose((0.0, 0.0, 1.8)))
     assert scan.ranges.shape == preset(size).shape
     assert scan.ranges.any()
+
+
+def test_what_is_nearest_of_several_meshes_is_measured(yard):
+    wall = Mesh(
+        torch.tensor([[6.0, -9, 0], [6, 9, 0], [6, 9, 1.6], [6, -9, 1.6]]), torch.tensor([[0, 1, 2], [0, 2, 3]])
+    )
+    sensor, here = preset("paper-16x1024"), pose((0.0, 0.0, 1.8))
+    one, other = (simulate(mesh, sensor, here).ranges for mesh in (yard, wall))
+    both = simulate([yard, wall], sensor, here).ranges
+    assert torch.equal(both, torch.where((other > 0) & ((one == 0) | (other < one)), other, one))
+    assert ((both == one) & (both > 0)).any()
+    assert ((both == other) & (both > 0)).any()
+
+
+def test_what_is_too_near_hides_what_is_behind(yard):
+    near = Mesh(torch.tensor([[1.0, -1, 1], [1, 1, 1], [1, 0, 3]]), torch.tensor([[0, 1, 2]]))
+    sensor = Sensor(torch.tensor([-0.1, -0.08]), torch.tensor([0.0, 2.0]))
+    open_, hidden = (simulate(world, sensor, pose((0.0, 0.0, 1.8))).ranges for world in (yard, [yard, near]))
+    assert (open_[:, 0] > 2).all()
+    assert (hidden[:, 0] == 0).all()
+    assert torch.equal(hidden[:, 1], open_[:, 1])
+
+
+@pytest.mark.parametrize("size", ["paper-16x1024", "paper-64x1024"])
+def test_many_poses_are_cast_in_one_call(yard_on, size, device):
+    mesh, sensor = yard_on(device), preset(size)
+    poses = pose(torch.tensor([[0.0, 0, 1.8], [5, 4, 2], [-20, 0, 1]]), torch.tensor([0.0, 1.0, 2.0]))
+    many = ranges(mesh, sensor, poses)
+    assert many.shape == (3, *sensor.shape)
+    for image, one in zip(many, poses, strict=True):
+        assert torch.equal(image, simulate(mesh, sensor, one).ranges)
+    assert ranges(mesh, sensor, poses.view(3, 1, 4, 4)).shape == (3, 1, *sensor.shape)
+    assert ranges(mesh, sensor, poses[:0]).shape == (0, *sensor.shape)
+
+
+def test_the_engine_follows_the_work(yard):
+    """Few rays are cast one by one, an image is projected; near triangles alone count."""
+    here = torch.zeros(3, dtype=torch.float64)
+    assert not yard.projects_faster(here, 500, 80.0)
+    assert yard.projects_faster(here, 128 * 2048, 80.0)
+    generator = torch.Generator().manual_seed(0)
+    middle = torch.randn(100_000, 1, 3, generator=generator)
+    dust = (middle + 0.01 * torch.randn(100_000, 3, 3, generator=generator)).view(-1, 3)
+    dense = Mesh(dust, torch.arange(300_000).view(-1, 3))
+    assert not dense.projects_faster(here, 16 * 1024, 80.0)
+    assert dense.projects_faster(torch.tensor([500.0, 0, 0]), 16 * 1024, 80.0)

@@ -35,7 +35,7 @@ def sensors(town):
 
 def test_same_seed_same_arrays(town):
     again = towns.build("town01", 0)
-    for field in ("vertices", "triangles", "waypoints", "headings"):
+    for field in ("vertices", "triangles", "waypoints", "headings", "parking", "walks"):
         np.testing.assert_array_equal(getattr(again, field), getattr(town, field))
 
 
@@ -52,7 +52,9 @@ def test_arrays_are_what_the_docstring_says(town):
     assert town.triangles.dtype == np.int32
     assert town.vertices.shape[1] == town.triangles.shape[1] == town.waypoints.shape[1] == 3
     assert town.headings.shape == (len(town.waypoints),)
-    for array in (town.vertices, town.waypoints, town.headings):
+    assert town.parking.dtype == town.walks.dtype == np.float32
+    assert town.parking.shape[1] == town.walks.shape[1] == 4
+    for array in (town.vertices, town.waypoints, town.headings, town.parking, town.walks):
         assert np.isfinite(array).all()
     assert town.triangles.min() >= 0
     assert town.triangles.max() < len(town.vertices)
@@ -110,6 +112,80 @@ def test_scans_look_like_streets(mesh, sensors):
     assert (np.abs(np.diff(ranges)) > 0.5).mean() > 0.04
 
 
+def test_traffic_is_drawn_anew_for_each_seed(town, sensors):
+    first, again, other = (towns.traffic(town, sensors[3], seed) for seed in (5, 5, [5, 1]))
+    for a, b in zip(first, again, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert first[0].shape != other[0].shape or (first[0] != other[0]).any()
+
+
+def test_traffic_stands_on_the_ground_and_clear_of_the_sensor(town, mesh, sensors):
+    sizes = []
+    for number, sensor in enumerate(sensors):
+        vertices, triangles = towns.traffic(town, sensor, number)
+        assert vertices.dtype == np.float32
+        assert triangles.dtype == np.int32
+        assert triangles.min() >= 0
+        assert triangles.max() < len(vertices)
+        np.testing.assert_array_equal(vertices * 1024, np.round(vertices * 1024))
+        sizes.append(len(triangles))
+        corners = vertices[triangles] - sensor
+        assert np.linalg.norm(corners[..., :2], axis=-1).min() > CLEARANCE
+        assert np.linalg.norm(corners[..., :2], axis=-1).max() < 85 + 6
+        up = _cast(mesh, vertices[::97] + np.float32([0, 0, 0.3]), np.float32([[0, 0, -1]]), 5.0)
+        assert (up > 0).mean() > 0.99
+        lowest = up[up > 0].min()
+        assert lowest > 0.01  # no wheel sinks far into the road
+    assert 5_000 < np.median(sizes) < 60_000
+    assert np.ptp(sizes) > 0.5 * np.median(sizes)
+
+
+def test_own_lane_is_free_ahead(town):
+    for number in range(0, len(town.waypoints), 301):
+        sensor, heading = town.waypoints[number] + np.float32([0, 0, SENSOR_HEIGHT]), town.headings[number]
+        away = towns.traffic(town, sensor, number)[0] - sensor
+        along = away[:, 0] * np.cos(heading) + away[:, 1] * np.sin(heading)
+        across = away[:, 1] * np.cos(heading) - away[:, 0] * np.sin(heading)
+        assert not ((np.abs(along) < 4.4) & (np.abs(across) < 1.2)).any()
+
+
+def test_traffic_does_not_overlap():
+    x = np.arange(-80, 80, 1.8, dtype=np.float32)
+    zero = np.zeros_like(x)
+    lane, spots = np.column_stack([x, zero, zero]), np.column_stack([x, zero, zero, zero])
+    empty = np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.int32)
+    line = towns.Town("a line", 0, *empty, lane, zero, spots, np.zeros((0, 4), dtype=np.float32))
+    for seed in range(20):
+        vertices, triangles = towns.traffic(line, (0.0, 0.0, SENSOR_HEIGHT), seed)
+        corners = vertices[triangles]
+        on_line = (corners[..., 1].min(1) < 0.3) & (corners[..., 1].max(1) > -0.3)
+        starts, ends = corners[on_line, :, 0].min(1), corners[on_line, :, 0].max(1)
+        order = np.argsort(starts)
+        ends = np.maximum.accumulate(ends[order])
+        first = np.concatenate([[0], np.nonzero(starts[order][1:] > ends[:-1])[0] + 1])
+        length = np.append(ends[first[1:] - 1], ends[-1]) - starts[order][first]
+        assert len(length) > 5
+        assert length.max() < 8.9  # a lorry
+
+
+def test_no_traffic_where_there_are_no_lanes(town):
+    vertices, triangles = towns.traffic(town, (5000.0, 0.0, 1.8), 0)
+    assert vertices.shape == triangles.shape == (0, 3)
+    assert vertices.dtype == np.float32
+    assert triangles.dtype == np.int32
+
+
 def test_unknown_name_is_refused():
     with pytest.raises(ValueError, match=r"'nowhere'.*town01"):
         towns.build("nowhere")
+
+
+def test_a_sector_of_the_traffic_is_the_part_of_it_that_a_sensor_sees_there(town):
+    at = town.waypoints[400].astype(float) + (0, 0, SENSOR_HEIGHT)
+    whole, part = (Mesh(*towns.traffic(town, at, 5, sector=s)) for s in (None, (2.5, 0.6)))
+    azimuth = np.linspace(2.5 - 0.6, 2.5 + 0.6, 400)
+    way = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(400, -0.05)], axis=1)
+    seen = _cast(whole, at[None], way)
+    assert (seen > 0).any()
+    np.testing.assert_array_equal(_cast(part, at[None], way), seen)
+    assert len(towns.traffic(town, at, 5, sector=(2.5, 0.6))[1]) < 0.5 * len(towns.traffic(town, at, 5)[1])

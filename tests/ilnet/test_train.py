@@ -9,9 +9,9 @@ from ilnet.simulate import pose, simulate
 
 
 @pytest.fixture
-def quick(monkeypatch, yard):
+def quick(monkeypatch, yard, quiet_street):
     """Training in the yard, with a network and batches of a size for tests."""
-    street = data.Street(yard, torch.tensor([[3.0, 0, 0], [-3, 2, 0], [0, -4, 0]]), torch.zeros(3))
+    street = quiet_street(yard, [[3, 0, 0]])
     monkeypatch.setattr(train.data, "street", lambda *args: street)
     monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
     size = train.Preset(blocks=1, steps=4, rate=1e-3, crops=2, columns=32, queries=64)
@@ -72,10 +72,10 @@ def test_the_figures_are_those_of_the_final_weights(tmp_path, quick, monkeypatch
     assert mae == pytest.approx(figures["val/mae"], rel=0.05)  # float32 here, bfloat16 there
 
 
-def test_training_lowers_the_loss(yard):
+def test_training_lowers_the_loss(yard, quiet_street):
     torch.manual_seed(0)
     model = models.create("iln", features=16, blocks=1, heads=4, dropout=0.0)
-    street = data.Street(yard, torch.tensor([[3.0, 0, 0], [-3, 2, 0]]), torch.zeros(2))
+    street = quiet_street(yard, [[3, 0, 0]])
     batch = next(iter(data.ContinuousRays([street], preset("paper-16x1024"), 4, 64, 256, seed=0)))
     training = train.Training(model, [], 1e-3, {})
     training.log = lambda *args, **kwargs: None
