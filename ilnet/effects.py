@@ -121,7 +121,7 @@ def simulate_with(
     Ranges below the sensor's minimum and beyond its maximum, noise included, are no returns.
 
     Args:
-        effects: What to do to them; with `Effects()` the scan is `ilnet.simulate.simulate`'s.
+        effects: What to do to them; with `Effects()` the ranges are those of `Mesh.cast`.
         meshes: The world, in metres, in pieces on one device: the nearest hit of all of them counts.
         sensor: Whose rays are cast.
         pose: (4, 4) transform from the sensor frame to the world in the middle of the turn.
