@@ -5,14 +5,14 @@ A range of 0 means no return, in scans and in files. Points are in the sensor fr
 `read` takes, by suffix:
 
 - `.npz`: `range` (H, W) [m], `elevation_deg` (H,) of its rows and `column_azimuth_deg` (W,) of its columns. Optional:
-  `min_range`, `max_range`, `norm_range` [m] (else the paper's 2, 80 and 100) and `name`. A sensor given to `read` goes
-  before all of these.
+  `min_range`, `max_range`, `norm_range` [m] (else the paper's 2, 80 and 100), `name` and `intensity` (H, W), 0 to 1. A
+  sensor given to `read` goes before all of these but the last.
 - `.npy`: ranges (H, W) of the sensor's shape, or points (N, 3) to (N, 8) that start with x, y, z. Needs a sensor.
 - `.bin`: KITTI, float32 x, y, z, intensity. The sensor is `hdl-64e` unless given.
 - `.ply`: vertices with x, y, z; ascii or binary. Needs a sensor.
 - `.pcd`: points with x, y, z; ascii, binary or binary_compressed. Needs a sensor; VIEWPOINT is not applied.
 
-`write` takes `.npz`, `.ply` and `.pcd`.
+`write` takes `.npz`, `.ply` and `.pcd`. Only `.npz` is read with its intensity.
 """
 
 import os
@@ -37,13 +37,16 @@ class Scan:
     Args:
         ranges: (H, W) [m], finite and >= 0; 0 = no return. Stored as float32.
         sensor: its `shape` is (H, W).
+        intensity: (H, W), how strong each return is, from 0 to 1; None where nobody measured it. Stored as float32 on
+            the device of `ranges`, and as 0 where there is no return.
 
     Raises:
-        ValueError: where the shapes differ or a range is NaN, infinite or negative.
+        ValueError: where the shapes differ, a range is NaN, infinite or negative, or an intensity is not in [0, 1].
     """
 
     ranges: torch.Tensor
     sensor: Sensor
+    intensity: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         ranges = _real_tensor("ranges", self.ranges).float()
@@ -63,6 +66,20 @@ class Scan:
                 "store 0 where nothing came back"
             )
         object.__setattr__(self, "ranges", ranges)
+        if self.intensity is None:
+            return
+        intensity = _real_tensor("intensity", self.intensity).to(ranges)
+        if intensity.shape != ranges.shape:
+            raise ValueError(
+                f"intensity has shape {tuple(intensity.shape)}, but ranges {tuple(ranges.shape)}: they must agree"
+            )
+        outside = ~((intensity >= 0) & (intensity <= 1))  # NaN too
+        if outside.any():
+            raise ValueError(
+                f"intensity must lie from 0 to 1, got {int(outside.sum())} others of {outside.numel()} values: "
+                "divide it by the largest that the sensor reports"
+            )
+        object.__setattr__(self, "intensity", intensity.where(ranges > 0, 0.0))
 
     def points(self) -> torch.Tensor:
         """Return the returns as points (N, 3) float32 [m], sensor frame, row by row."""
@@ -82,7 +99,8 @@ class Scan:
     def decimate(self, rows: int | None = None, columns: int | None = None) -> "Scan":
         """Return the scan of only some of the beams and columns; see `Sensor.decimation`."""
         row_index, column_index = (torch.from_numpy(index) for index in self.sensor.decimation(rows, columns))
-        return Scan(self.ranges[row_index][:, column_index], self.sensor.decimate(rows, columns))
+        intensity = None if self.intensity is None else self.intensity[row_index][:, column_index]
+        return Scan(self.ranges[row_index][:, column_index], self.sensor.decimate(rows, columns), intensity)
 
     @classmethod
     def from_points(cls, points: torch.Tensor | np.ndarray, sensor: Sensor) -> "Scan":
@@ -153,6 +171,8 @@ def read(path: str | Path, sensor: Sensor | None = None) -> Scan:
 def write(path: str | Path, scan: Scan) -> None:
     """Write a scan: `.npz` whole and without loss, `.ply` (binary, with the range) and `.pcd` (binary) its points.
 
+    Points carry their intensity where the scan has it.
+
     Folders are created as needed. An earlier file of that name stays untouched unless the new one is complete.
 
     Raises:
@@ -189,13 +209,13 @@ def _real_tensor(name: str, value: object) -> torch.Tensor:
 
 
 def _read_npz(path: Path, sensor: Sensor | None) -> Scan:
-    optional = ("min_range", "max_range", "norm_range", "name")
+    limits = ("min_range", "max_range", "norm_range", "name")
     if not zipfile.is_zipfile(path):
         raise ValueError("it is not a whole .npz archive: it was cut short or never was one")
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             found = list(file.files)
-            wanted = ("range", "elevation_deg", "column_azimuth_deg", *optional)
+            wanted = ("range", "elevation_deg", "column_azimuth_deg", "intensity", *limits)
             arrays = {key: file[key] for key in wanted if key in found}
     except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds on damaged archives
         raise ValueError(f"it cannot be unpacked: {error}") from error
@@ -206,8 +226,9 @@ def _read_npz(path: Path, sensor: Sensor | None) -> Scan:
         raise ValueError(f"it lacks {', '.join(missing)}; its keys are {', '.join(found) or 'none'}{remedy}")
     if sensor is None:
         elevations, azimuths = (_real_tensor(key, arrays[key]).double().deg2rad().numpy() for key in needed[1:])
-        sensor = Sensor(elevations, azimuths, **{key: arrays[key] for key in optional if key in arrays})
-    return Scan(_real_tensor("range", arrays["range"]), sensor)
+        sensor = Sensor(elevations, azimuths, **{key: arrays[key] for key in limits if key in arrays})
+    intensity = _real_tensor("intensity", arrays["intensity"]) if "intensity" in arrays else None
+    return Scan(_real_tensor("range", arrays["range"]), sensor, intensity)
 
 
 def _read_npy(path: Path, sensor: Sensor | None) -> Scan:
@@ -387,34 +408,44 @@ def _lzf(data: bytes, size: int) -> bytes:
 
 def _write_npz(file: BinaryIO, scan: Scan) -> None:
     sensor = scan.sensor
-    np.savez_compressed(
-        file,
+    arrays = dict(
         range=scan.ranges.cpu().numpy(),
         elevation_deg=np.rad2deg(sensor.elevations),
         column_azimuth_deg=np.rad2deg(sensor.azimuths),
-        min_range=sensor.min_range,
-        max_range=sensor.max_range,
-        norm_range=sensor.norm_range,
-        name=sensor.name,
+        min_range=np.array(sensor.min_range),
+        max_range=np.array(sensor.max_range),
+        norm_range=np.array(sensor.norm_range),
+        name=np.array(sensor.name),
     )
+    if scan.intensity is not None:
+        arrays["intensity"] = scan.intensity.cpu().numpy()
+    np.savez_compressed(file, **arrays)
+
+
+def _point_rows(scan: Scan, **images: torch.Tensor | None) -> tuple[list[str], np.ndarray]:
+    """Return the names of the fields of a point, and the points (N, fields): x, y, z, and what images say of them."""
+    known = {name: image for name, image in images.items() if image is not None}
+    measured = scan.ranges > 0
+    rows = torch.cat((scan.points(), *(image[measured, None] for image in known.values())), dim=1)
+    return ["x", "y", "z", *known], rows.cpu().numpy().astype("<f4")
 
 
 def _write_ply(file: BinaryIO, scan: Scan) -> None:
-    points = scan.points()
-    rows = torch.cat((points, scan.ranges[scan.ranges > 0, None]), dim=1).cpu().numpy().astype("<f4")
-    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "range"))
+    fields, rows = _point_rows(scan, range=scan.ranges, intensity=scan.intensity)
+    properties = "".join(f"property float {name}\n" for name in fields)
     file.write(f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n".encode())
     file.write(rows.tobytes())
 
 
 def _write_pcd(file: BinaryIO, scan: Scan) -> None:
-    points = scan.points().cpu().numpy().astype("<f4")
+    fields, rows = _point_rows(scan, intensity=scan.intensity)
+    sizes, types, counts = (" ".join(entry * len(fields)) for entry in ("4", "F", "1"))
     file.write(
         "# .PCD v0.7 - Point Cloud Data file format\n"
-        "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
-        f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA binary\n".encode()
+        f"VERSION 0.7\nFIELDS {' '.join(fields)}\nSIZE {sizes}\nTYPE {types}\nCOUNT {counts}\n"
+        f"WIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n".encode()
     )
-    file.write(points.tobytes())
+    file.write(rows.tobytes())
 
 
 _READERS = {".npz": _read_npz, ".npy": _read_npy, ".bin": _read_bin, ".ply": _read_ply, ".pcd": _read_pcd}

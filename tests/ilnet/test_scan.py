@@ -87,6 +87,58 @@ def test_bad_ranges(ranges, message):
         Scan(ranges, SENSOR)
 
 
+# Intensity
+
+
+def bright() -> Scan:
+    """The toy with intensities 0, 1/15, ... 1, two of them where nothing returned."""
+    return Scan(toy().ranges, SENSOR, torch.arange(16).view(4, 4) / 15)
+
+
+def test_intensity_is_zero_where_nothing_returned():
+    assert toy().intensity is None
+    found = bright().intensity
+    assert found.dtype == torch.float32
+    assert found[0, 1] == found[3, 3] == 0
+    assert found[2, 2] == pytest.approx(10 / 15)
+
+
+def test_decimate_keeps_the_intensity_of_each_pixel():
+    few = bright().decimate(3, 2)
+    assert torch.equal(few.intensity, bright().intensity[[0, 2, 3]][:, [0, 2]])
+
+
+@pytest.mark.parametrize(
+    ("intensity", "message"),
+    [
+        (torch.zeros(4, 5), r"intensity has shape \(4, 5\), but ranges \(4, 4\)"),
+        (np.full((4, 4), 255, np.uint8), "from 0 to 1, got 16 others of 16 values: divide"),
+        (torch.tensor([math.nan, -0.1, 0, 1] * 4).view(4, 4), "got 8 others of 16 values"),
+    ],
+)
+def test_bad_intensity(intensity, message):
+    with pytest.raises(ValueError, match=message):
+        Scan(toy().ranges, SENSOR, intensity)
+
+
+def test_files_keep_the_intensity(tmp_path):
+    write(tmp_path / "a.npz", bright())
+    assert torch.equal(read(tmp_path / "a.npz").intensity, bright().intensity)
+    write(tmp_path / "plain.npz", toy())
+    assert read(tmp_path / "plain.npz").intensity is None
+    for name, end, field in (
+        ("a.ply", b"end_header\n", b"property float range\nproperty float intensity\n"),
+        ("a.pcd", b"DATA binary\n", b"FIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"),
+    ):
+        write(tmp_path / name, bright())
+        header, body = (tmp_path / name).read_bytes().split(end)
+        assert field in header
+        points = np.frombuffer(body, "<f4").reshape(14, -1)
+        np.testing.assert_array_equal(points[:, :3], bright().points())
+        np.testing.assert_array_equal(points[:, -1], bright().intensity[bright().ranges > 0])
+        torch.testing.assert_close(read(tmp_path / name, SENSOR).ranges, toy().ranges, **ROUND_TRIP)
+
+
 # Points to a range image
 
 
