@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ilnet.sensor import Sensor, preset
-from ilnet.simulate import pose, ranges, simulate
+from ilnet.simulate import Effects, pose, ranges, simulate
 from kernels import Mesh
 
 # float32 of coordinates up to 100 m.
@@ -113,3 +113,15 @@ def test_the_engine_follows_the_work(yard):
     dense = Mesh(dust, torch.arange(300_000).view(-1, 3))
     assert not dense.projects_faster(here, 16 * 1024, 80.0)
     assert dense.projects_faster(torch.tensor([500.0, 0, 0]), 16 * 1024, 80.0)
+
+
+def test_effects_are_drawn_from_the_seed(yard):
+    sensor, here = preset("paper-16x1024"), pose((0.0, 0.0, 1.8))
+    noisy = Effects(range_noise=0.02, intensity=True)
+    first, again, other = (simulate(yard, sensor, here, noisy, seed) for seed in (1, 1, 2))
+    clean = simulate(yard, sensor, here).ranges
+    assert torch.equal(first.ranges, again.ranges)
+    assert not torch.equal(first.ranges, other.ranges)
+    both = (clean > 0) & (first.ranges > 0)
+    assert (first.ranges - clean)[both].std() == pytest.approx(0.02, rel=0.05)
+    assert first.intensity[both].min() > 0
