@@ -25,6 +25,7 @@ from torch import nn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from ilnet import data, demo, models, simulate
+from ilnet import train as training
 from ilnet.models.base import OFFSET_SCALE, normalised
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
@@ -316,6 +317,38 @@ def train() -> Iterator[Row]:
         f"{TRAIN_SCANS} scans x {TRAIN_QUERIES} queries",
         partial(step, ours),
         {"the authors' formulation, eager, float32": partial(step, plain)},
+    )
+    yield from _draw_batches(model, optimizer, device)
+
+
+def _draw_batches(model: models.ILN, optimizer: torch.optim.Optimizer, device: torch.device) -> Iterator[Row]:
+    """What it takes to draw a batch of continuous rays, beside the step of training that it is for."""
+    size = training.PRESETS["tiny"]
+    street = data.street(demo.TOWN, 0, device)
+    rays = data.ContinuousRays([street], preset(INPUT), size.crops, size.columns, size.queries, seed=0)
+    batches = iter(rays)
+    image, queries, truth = (tensor.to(device) for tensor in next(batches))
+
+    nothing = [torch.zeros(1)]  # they have no result in common
+
+    def draw() -> list[torch.Tensor]:
+        next(batches)
+        return nothing
+
+    def step() -> list[torch.Tensor]:
+        optimizer.zero_grad()
+        with torch.autocast(device.type, torch.bfloat16):
+            predicted = model(image, queries, wrap=False)
+        (predicted - truth).abs().mean().backward()
+        optimizer.step()
+        return nothing
+
+    yield from _compare(
+        "continuous-rays",
+        f"{size.crops} crops x {size.queries} rays, one batch",
+        draw,
+        {"the training step of iln that takes it": step},
+        repeat=3,
     )
 
 
