@@ -21,7 +21,7 @@ def quick(monkeypatch, yard, quiet_street):
 
 def test_writes_weights_that_load_and_figures(tmp_path, quick):
     figures = quick(tmp_path)
-    assert set(figures) == {f"val/{name}" for name in ("mae", "iou", "precision", "recall", "f1")}
+    assert set(figures) == {f"val/{name}" for name in metrics.FIGURES}
     model = models.load(tmp_path / "iln-prior.safetensors")
     assert model.prior == models.create("iln-prior").prior
     with open(tmp_path / "iln-prior" / "from-step-0" / "metrics.csv") as log:
