@@ -18,16 +18,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import nn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from ilnet import data, demo, models
+from ilnet import data, demo, models, simulate
+from ilnet import train as training
 from ilnet.models.base import OFFSET_SCALE, normalised
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
-from ilnet.simulate import best_device, simulate
+from ilnet.simulate import best_device
 from kernels import area_blend, gather_blend, neighbour_attention, project_pixels, reference
 
 __all__ = ["SECTIONS", "Row", "bench", "peak_memory", "table"]
@@ -36,6 +38,8 @@ INPUT, OUTPUT, LARGE = "paper-16x1024", "paper-128x2048", (256, 4096)
 # Queries of an op: those of a frame, and a quarter of it where each has 4 tokens of 64 numbers.
 BLENDS, TOKENS = 262_144, 65_536
 TRAIN_SCANS, TRAIN_QUERIES = 4, 16_384
+# Cast in one call: a GPU has room for several.
+SCANS = {"cpu": 1, "cuda": 16}
 CHUNK = 2048
 
 ROUNDS = 3
@@ -314,30 +318,94 @@ def train() -> Iterator[Row]:
         partial(step, ours),
         {"the authors' formulation, eager, float32": partial(step, plain)},
     )
+    yield from _draw_batches(model, optimizer, device)
+
+
+def _draw_batches(model: models.ILN, optimizer: torch.optim.Optimizer, device: torch.device) -> Iterator[Row]:
+    """What it takes to draw a batch of continuous rays, beside the step of training that it is for."""
+    size = training.PRESETS["tiny"]
+    street = data.street(demo.TOWN, 0, device)
+    rays = data.ContinuousRays([street], preset(INPUT), size.crops, size.columns, size.queries, seed=0)
+    batches = iter(rays)
+    image, queries, truth = (tensor.to(device) for tensor in next(batches))
+
+    nothing = [torch.zeros(1)]  # they have no result in common
+
+    def draw() -> list[torch.Tensor]:
+        next(batches)
+        return nothing
+
+    def step() -> list[torch.Tensor]:
+        optimizer.zero_grad()
+        with torch.autocast(device.type, torch.bfloat16):
+            predicted = model(image, queries, wrap=False)
+        (predicted - truth).abs().mean().backward()
+        optimizer.step()
+        return nothing
+
+    yield from _compare(
+        "continuous-rays",
+        f"{size.crops} crops x {size.queries} rays, one batch",
+        draw,
+        {"the training step of iln that takes it": step},
+        repeat=3,
+    )
 
 
 def rays() -> Iterator[Row]:
-    """Scans cast in a town."""
+    """Scans cast in a town, beside Open3D's and embreex's rays where these are installed."""
     device = best_device()
     street = data.street(demo.TOWN, 0, device)
-    pose = street.pose(0)
+    poses = torch.stack([street.pose(number) for number in range(0, 100 * SCANS[device.type], 100)])
     for sensor in (preset("paper-64x1024"), preset(OUTPUT), preset(OUTPUT).resize(*LARGE)):
-        size = "{}x{} rays in {}".format(*sensor.shape, demo.TOWN)
-        cast = partial(_cast, street, sensor, pose)
+        size = "{} x {}x{}, {:.0f}k triangles".format(len(poses), *sensor.shape, len(street.town.triangles) / 1000)
+        cast = partial(_cast, street, sensor, poses)
         alone: dict[str, Work] = {"the same BVH on one core, as Warp launches it": partial(_on_one_core, cast)}
-        yield from _compare("rays-bvh", size, cast, alone, repeat=3)
-        project = partial(_project, street, sensor, pose)
-        yield from _compare("rays-projection", size, project, {"our BVH on all cores": cast}, repeat=3)
+        if device.type == "cuda":
+            yield from _compare("rays-bvh", size, cast, _embree(street, sensor, poses), repeat=3)
+            continue
+        yield from _compare("rays-bvh", size, cast, alone)
+        project = partial(_project, street, sensor, poses)
+        yield from _compare("rays-projection", size, project, {"our BVH on all cores": cast, **alone})
+        yield from _compare("rays-projection", size, project, _embree(street, sensor, poses), repeat=5)
 
 
-def _cast(street: data.Street, sensor: Sensor, pose: torch.Tensor) -> list[torch.Tensor]:
-    return [simulate(street.mesh, sensor, pose).ranges]
+def _cast(street: data.Street, sensor: Sensor, poses: torch.Tensor) -> list[torch.Tensor]:
+    return [simulate.cast(street.mesh, poses, sensor.directions().view(-1, 3), sensor.max_range)]
 
 
-def _project(street: data.Street, sensor: Sensor, pose: torch.Tensor) -> list[torch.Tensor]:
+def _project(street: data.Street, sensor: Sensor, poses: torch.Tensor) -> list[torch.Tensor]:
     tables = torch.tensor(sensor.elevations), torch.tensor(sensor.azimuths)
-    ranges = street.mesh.project(pose, *tables, sensor.max_range)
-    return [ranges.where(ranges >= sensor.min_range, 0.0)]
+    return [street.mesh.project(pose, *tables, sensor.max_range) for pose in poses]
+
+
+def _embree(street: data.Street, sensor: Sensor, poses: torch.Tensor) -> dict[str, Work]:
+    """The same rays by other libraries, for those that are installed; they are given the rays ready-made."""
+    directions = (sensor.directions().view(-1, 3).double() @ poses[:, :3, :3].mT).float()
+    origins = poses[:, None, :3, 3].float().expand_as(directions)
+    rays = torch.cat((origins, directions), 2).view(-1, 6).numpy()
+    vertices, triangles = street.town.vertices, street.town.triangles
+    found: dict[str, Work] = {}
+    with contextlib.suppress(ImportError):
+        import open3d
+
+        scene = open3d.t.geometry.RaycastingScene(nthreads=torch.get_num_threads())
+        scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(triangles.astype("uint32")))
+        found["Open3D"] = lambda: [_limited(scene.cast_rays(open3d.core.Tensor(rays))["t_hit"].numpy(), sensor)]
+    with contextlib.suppress(ImportError):
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        world = EmbreeScene()
+        TriangleMesh(world, vertices, triangles)
+        start, way = (rays[:, half].copy() for half in (slice(0, 3), slice(3, 6)))
+        found["embreex, one core"] = lambda: [_limited(world.run(start, way, query="DISTANCE"), sensor)]
+    return found
+
+
+def _limited(distances: np.ndarray, sensor: Sensor) -> torch.Tensor:
+    ranges = torch.from_numpy(distances)
+    return ranges.where(ranges <= sensor.max_range, 0.0)
 
 
 def _on_one_core(work: Work) -> list[torch.Tensor]:

@@ -1,15 +1,16 @@
-"""A sensor, a pose and a mesh make a scan."""
+"""A sensor, a pose and meshes make a scan."""
 
 import math
 from collections.abc import Sequence
 
 import torch
 
+from ilnet.effects import Effects, simulate_with
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 from kernels import Mesh
 
-__all__ = ["World", "best_device", "cast", "nearest", "pose", "ranges", "simulate"]
+__all__ = ["Effects", "World", "best_device", "cast", "nearest", "pose", "ranges", "simulate"]
 
 Angle = float | torch.Tensor
 # One mesh or several: a town, and the traffic in it.
@@ -104,15 +105,20 @@ def _images(mesh: Mesh, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
     return torch.cat(images)
 
 
-def simulate(world: World, sensor: Sensor, pose: torch.Tensor) -> Scan:
+def simulate(world: World, sensor: Sensor, pose: torch.Tensor, effects: Effects | None = None, seed: int = 0) -> Scan:
     """Casts every ray of a sensor.
 
     Args:
         world: Meshes, metres; what is nearest is measured.
         sensor: Whose rays are cast.
-        pose: (4, 4) transform from the sensor frame to the world.
+        pose: (4, 4) transform from the sensor frame to the world; in the middle of the turn where the sensor moves.
+        effects: What a real sensor does to its measurements; nothing where None.
+        seed: Of their random numbers.
 
     Returns:
         The scan; 0 where nothing is met between the sensor's minimum and maximum range.
     """
-    return Scan(ranges(world, sensor, pose), sensor)
+    if effects is None:
+        return Scan(ranges(world, sensor, pose), sensor)
+    meshes = [world] if isinstance(world, Mesh) else world
+    return simulate_with(effects, meshes, sensor, pose, torch.Generator().manual_seed(seed))

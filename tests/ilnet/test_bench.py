@@ -17,7 +17,8 @@ KEYS = ["name", "size", "ours_s", "other", "other_s", "ratio", "max_abs_diff", "
 METRES = 1e-3
 
 
-def test_rays_prints_a_json_list():
+def test_rays_prints_a_json_list(monkeypatch):
+    monkeypatch.setattr(bench, "LARGE", (32, 512))
     done = CliRunner(catch_exceptions=False).invoke(cli, ["bench", "rays", "--json"])
     assert done.exit_code == 0
     rows = json.loads(done.stdout)

@@ -181,7 +181,7 @@ def test_unknown_name_is_refused():
 
 
 def test_a_sector_of_the_traffic_is_the_part_of_it_that_a_sensor_sees_there(town):
-    at = town.waypoints[400].astype(float) + (0, 0, SENSOR_HEIGHT)
+    at = town.waypoints[400] + np.float32([0, 0, SENSOR_HEIGHT])
     whole, part = (Mesh(*towns.traffic(town, at, 5, sector=s)) for s in (None, (2.5, 0.6)))
     azimuth = np.linspace(2.5 - 0.6, 2.5 + 0.6, 400)
     way = np.stack([np.cos(azimuth), np.sin(azimuth), np.full(400, -0.05)], axis=1)
