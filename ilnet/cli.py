@@ -113,7 +113,7 @@ def survey(
     from ilnet.towns import NAMES
 
     entries = comparison.survey(scans, zip(meshes, at, strict=True), NAMES if towns == ("all",) else towns)
-    found = json.dumps(comparison.records(entries), indent=1)
+    found = "[\n" + ",\n".join(map(json.dumps, comparison.records(entries))) + "\n]"
     comparison.draw(entries, out / "survey.png")
     (out / "survey.json").write_text(found + "\n")
     click.echo(
