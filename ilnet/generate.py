@@ -52,7 +52,8 @@ class Place(NamedTuple):
     """Whose traffic is drawn; None where there is none."""
 
 
-Places = dict[str, Callable[[torch.device], Place]]
+# How to build each.
+Places = dict[str, Callable[[], Place]]
 
 
 def town_places(names: Iterable[str]) -> Places:
@@ -71,21 +72,23 @@ def town_places(names: Iterable[str]) -> Places:
     return places
 
 
-def _build_town(name: str, seed: int, device: torch.device) -> Place:
+def _build_town(name: str, seed: int) -> Place:
     town = towns.build(name, seed)
-    return Place(Mesh(town.vertices, town.triangles, device), torch.tensor(town.waypoints).double(), town)
+    return Place(
+        Mesh(town.vertices, town.triangles, simulate.best_device()), torch.tensor(town.waypoints).double(), town
+    )
 
 
-def mesh_place(mesh: Path, positions: Path) -> Places:
-    """Returns how to read a mesh.
+def mesh_place(file: Path, positions: Path) -> Places:
+    """Reads a mesh to scan.
 
     Args:
-        mesh: A file that PyVista reads, metres, z up.
+        file: What PyVista reads, metres, z up.
         positions: JSON, whose `positions` are a list of [x, y, z], metres in the mesh, of the sensor.
 
     Raises:
-        OSError: If `positions` cannot be read.
-        ValueError: If it does not hold positions.
+        OSError: If a file cannot be read.
+        ValueError: If one is damaged, or there is no ground under a position.
     """
     try:
         at = torch.tensor(json.loads(positions.read_bytes())["positions"], dtype=torch.float64)
@@ -95,23 +98,19 @@ def mesh_place(mesh: Path, positions: Path) -> Places:
         raise ValueError(
             f'{positions}: should be JSON like {{"positions": [[x, y, z], ...]}}, finite metres in the mesh'
         ) from None
-    if not mesh.is_file():
-        raise FileNotFoundError(f"{mesh}: there is no such file; give the path of a mesh")
-    digest = hashlib.sha256(mesh.read_bytes() + positions.read_bytes()).hexdigest()
-    return {f"{mesh.name}@{digest[:16]}": partial(_read_mesh, mesh, at)}
-
-
-def _read_mesh(mesh: Path, at: torch.Tensor, device: torch.device) -> Place:
-    place = Place(Mesh(*meshes.read(mesh), device), at - torch.tensor([0, 0, SENSOR_HEIGHT]), None)
-    down = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64, device=device)
-    ground = place.mesh.cast(at.to(device), down, _GROUND_WITHIN).range.cpu()
+    mesh = Mesh(*meshes.read(file), simulate.best_device())
+    down = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64, device=mesh.device)
+    ground = mesh.cast(at.to(mesh.device), down, _GROUND_WITHIN).range.cpu()
     for number in (ground == 0).nonzero()[:1, 0].tolist():
         x, y, z = at[number].tolist()
         raise ValueError(
-            f"{mesh}: no triangle under position {number} ({x:g}, {y:g}, {z:g}) within {_GROUND_WITHIN:g} m; "
+            f"{file}: no triangle under position {number} ({x:g}, {y:g}, {z:g}) within {_GROUND_WITHIN:g} m; "
             "move it or leave it out"
         )
-    return place
+    place = Place(mesh, at - torch.tensor([0, 0, SENSOR_HEIGHT]), None)
+    # Another mesh or other positions under the same name are another archive.
+    digest = hashlib.sha256(file.read_bytes() + positions.read_bytes()).hexdigest()
+    return {f"{file.name}@{digest[:16]}": lambda: place}
 
 
 def sensors_of_sizes(sizes: Iterable[str]) -> list[Sensor]:
@@ -141,7 +140,7 @@ def generate(
     Args:
         out: The archive's folder.
         places: Where scans are taken, equally often; see `town_places` and `mesh_place`.
-        scans: How many at all.
+        scans: Their number, of all parts.
         sensors: Each takes every scan, of the same world and from the same pose.
         seed: Of waypoints, poses and traffic.
         shard: (i, n): this run does part i of n, counted from 1.
@@ -161,8 +160,8 @@ def generate(
             raise ValueError(f"two sensors have {size} rays; give each an archive of its own")
         sizes[size] = sensor
     workers = workers or torch.get_num_threads()
-    device = simulate.best_device()
-    attributes = {"towns": list(places), "seed": seed, "device": device.type, "version": version("ilnet")}
+    device = simulate.best_device().type
+    attributes = {"towns": list(places), "seed": seed, "device": device, "version": version("ilnet")}
     archive = Archive.create(out, scans, sizes, attributes)
     part, parts = shard
     units = {unit for unit in range(-(-scans // UNIT)) if unit % parts == part - 1}
@@ -173,12 +172,12 @@ def generate(
     todo = sum(len(plan.scans(unit)) for unit in missing)
     needed = sorted({plan.town(k) for unit in missing for k in plan.scans(unit)})
     for number in tqdm(needed, desc="towns", unit=" towns", leave=False, disable=not needed):
-        plan.places[number] = list(places.values())[number](device)
+        plan.places[number] = list(places.values())[number]()
         # Compiles the kernels and sorts the triangles, once for all workers.
         plan.images(plan.first[number])
     with tqdm(total=total, initial=total - todo, desc=str(out), unit=" scans") as progress:
         start, done = time.perf_counter(), 0
-        with contextlib.closing(_run(plan, missing, 1 if device.type == "cuda" else workers)) as counts:
+        with contextlib.closing(_run(plan, missing, 1 if device == "cuda" else workers)) as counts:
             for count in counts:
                 done += count
                 rate = done * rays / (time.perf_counter() - start) / 1e6

@@ -181,7 +181,8 @@ class Archive:
             for name, value in values.items():
                 # A file of nothing but fill values counts as much as another: without it the unit would be incomplete.
                 if not self._file(name, unit).exists():
-                    zarr.open_array(store, path=name, mode="r+", config={"write_empty_chunks": True})[scans] = value
+                    array = zarr.open_array(store, path=name, mode="r+")
+                    array.with_config({"write_empty_chunks": True})[scans] = value
         except OSError as error:
             raise _unwritable(self.path, error) from error
 
