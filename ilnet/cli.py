@@ -10,6 +10,8 @@ import click
 
 __all__ = ["main"]
 
+_SIZES = "16x1024,64x1024,128x2048,256x4096"
+
 # The commands import what they need themselves, so that `--help` and a typing error answer at once.
 
 
@@ -74,6 +76,61 @@ def train(model: str, preset: str, steps: int | None, seed: int, out: Path) -> N
 
     figures = training.train(model, preset, out, steps, seed)
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
+
+
+@cli.command()
+@click.option("--towns", metavar="NAMES", help="Towns, comma separated, with a seed as in town01:7; all unless told.")
+@click.option("--mesh", type=Path, metavar="FILE", help="Scan this mesh (metres, z up) instead of towns.")
+@click.option("--at", type=Path, metavar="JSON", help='Sensor positions in the mesh [m]: {"positions": [[x, y, z]]}.')
+@click.option("--scans", type=click.IntRange(min=1), required=True, metavar="N", help="Poses to scan from, in all.")
+@click.option("--sizes", metavar="HxW", help=f"Of the paper's sensor, comma separated; {_SIZES} unless told.")
+@click.option("--sensor", metavar="NAMES", help="Presets, comma separated, instead of --sizes.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of waypoints, poses, traffic.")
+@click.option("--shard", metavar="I/N", default="1/1", help="Do part I of N, for many hosts; merge by copying files.")
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes on a CPU; all cores unless told.")
+@click.option("--out", type=Path, required=True, help="Folder of the archive; an interrupted run goes on there.")
+def simulate(
+    towns: str | None,
+    mesh: Path | None,
+    at: Path | None,
+    scans: int,
+    sizes: str | None,
+    sensor: str | None,
+    seed: int,
+    shard: str,
+    workers: int | None,
+    out: Path,
+) -> None:
+    """Simulate scans into a Zarr archive; killed at any moment, the same command goes on."""
+    if bool(mesh) != bool(at):
+        raise click.UsageError("--mesh FILE and --at JSON go together")
+    if mesh and towns:
+        raise click.UsageError("--mesh and --towns exclude each other")
+    if sizes and sensor:
+        raise click.UsageError("--sizes and --sensor exclude each other")
+    part, _, parts = shard.partition("/")
+    if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
+        raise click.UsageError(f"--shard is {shard!r}; it should be I/N with 1 <= I <= N, such as 2/3")
+    from ilnet import generate
+    from ilnet.sensor import preset
+    from ilnet.towns import NAMES
+
+    if mesh and at:
+        places = generate.mesh_place(mesh, at)
+    else:
+        places = generate.town_places(towns.split(",") if towns else NAMES)
+    if sensor:
+        sensors = [preset(name) for name in sensor.split(",")]
+    else:
+        sensors = generate.sensors_of_sizes((sizes or _SIZES).split(","))
+    try:
+        archive = generate.generate(out, places, scans, sensors, seed, (int(part), int(parts)), workers)
+    except KeyboardInterrupt:
+        click.echo(f"interrupted: what is complete stays in {out}; the same command goes on from there", err=True)
+        raise
+    left = len(archive.missing())
+    state = f"{left} units of {generate.UNIT} scans are left to other shards" if left else "complete"
+    click.echo(f"{out}: {scans} scans of {', '.join(archive.sizes)}: {state}")
 
 
 @cli.command()

@@ -13,9 +13,10 @@ from torch.utils.data import IterableDataset, get_worker_info
 from ilnet import simulate, towns
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, angles_to_directions
+from ilnet.store import open_archive
 from kernels import Mesh
 
-__all__ = ["Batch", "ContinuousRays", "Street", "held_out_scans", "street"]
+__all__ = ["Batch", "ContinuousRays", "Street", "held_out_scans", "open_archive", "street"]
 
 # Metres above the lane, and how it varies from car to car.
 SENSOR_HEIGHT = 1.8
