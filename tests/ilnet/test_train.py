@@ -94,7 +94,7 @@ def test_the_loss_is_in_units_of_the_normalised_range(yard):
     model = models.create("iln", features=16, blocks=1, heads=4).eval()
     training = train.Training(model, [], 1e-3, {})
     training.log = lambda *args, **kwargs: None
-    batch = data.Batch(torch.full((1, 4, 8), 20.0), torch.rand(1, 5, 2) * 3, torch.full((1, 5), 70.0))
+    batch = data.Batch(torch.full((1, 4, 8), 20.0), torch.rand(1, 5, 2) * 3, torch.full((1, 5), 70.0), False)
     assert training.training_step(batch, 0).item() == pytest.approx(50 * 2 / 100)
 
 
