@@ -69,12 +69,16 @@ def demo(
 @click.option("--preset", default="tiny", show_default=True, help="Size of the network and of its training.")
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps, instead of the preset's.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of weights and rays.")
+@click.option("--data", type=Path, metavar="DIR", help="Learn from stored images: an archive or a tree of .rimg files.")
 @click.option("--out", type=Path, default=Path("runs"), show_default=True, help="Folder for weights, figures, logs.")
-def train(model: str, preset: str, steps: int | None, seed: int, out: Path) -> None:
-    """Train MODEL on rays cast at continuous directions; goes on where an interrupted run in --out stopped."""
+def train(model: str, preset: str, steps: int | None, seed: int, data: Path | None, out: Path) -> None:
+    """Train MODEL on rays cast at continuous directions; goes on where an interrupted run in --out stopped.
+
+    `torchrun --nproc-per-node N -m ilnet train MODEL` shares each batch among N processes or GPUs.
+    """
     from ilnet import train as training
 
-    figures = training.train(model, preset, out, steps, seed)
+    figures = training.train(model, preset, out, steps, seed, data)
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
 
 
