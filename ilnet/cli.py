@@ -182,6 +182,19 @@ def survey(
     )
 
 
+@cli.command()
+@click.option(
+    "--town", "names", multiple=True, metavar="NAME", help="Draw this town; may be repeated. All unless told."
+)
+@click.option("--out", type=Path, default=Path("towns_output"), show_default=True, help="Folder for the pictures.")
+def towns(names: tuple[str, ...], out: Path) -> None:
+    """Draw the procedural towns: from above, from the street, and one scan of each."""
+    from ilnet.towns import NAMES, pictures
+
+    for path in pictures.draw(list(names or NAMES), out):
+        click.echo(path)
+
+
 def _table(methods: dict[str, dict[str, Any]]) -> str:
     columns = {"mae": "MAE [m]", "iou": "IoU", "precision": "precision", "recall": "recall", "f1": "F1"}
     lines = [f"{'method':18}" + "".join(f"{title:>11}" for title in columns.values())]
