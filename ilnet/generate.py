@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -187,17 +186,16 @@ def generate(
     return archive
 
 
-@dataclass
 class _Plan:
-    """What each scan of an archive is."""
+    """What each scan of an archive is, once `places` holds its town."""
 
-    archive: Archive
-    seed: int
-
-    def __post_init__(self) -> None:
+    def __init__(self, archive: Archive, seed: int):
+        self.archive, self.seed = archive, seed
         self.places: dict[int, Place] = {}
-        towns, scans = len(self.archive.towns), len(self.archive)
-        self.first = [scans * number // towns for number in range(towns)]
+        """For the numbers of towns."""
+        count = len(archive.towns)
+        self.first = [len(archive) * number // count for number in range(count)]
+        """The first scan of each town."""
 
     def scans(self, unit: int) -> range:
         """Which scans a unit holds."""
