@@ -144,6 +144,40 @@ def bench(sections: tuple[str, ...], as_json: bool) -> None:
     click.echo(json.dumps([row.json() for row in rows], indent=1) if as_json else benchmarks.table(rows))
 
 
+@cli.command()
+@click.option(
+    "--scan", "scans", type=Path, multiple=True, metavar="FILE", help="A measured scan that names its angles."
+)
+@click.option("--mesh", "meshes", type=Path, multiple=True, metavar="FILE", help="A mesh (metres, z up).")
+@click.option("--at", type=Path, multiple=True, metavar="JSON", help="Positions in the mesh: one file for each --mesh.")
+@click.option("--town", "towns", multiple=True, metavar="NAME", help="A town, or `all` of them.")
+@click.option("--out", type=Path, default=Path("survey_output"), show_default=True, help="Folder for the figure.")
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON list instead of the table.")
+def survey(
+    scans: tuple[Path, ...],
+    meshes: tuple[Path, ...],
+    at: tuple[Path, ...],
+    towns: tuple[str, ...],
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Compare towns and meshes with measured scans, all seen with the rays of each scan: a table and a figure."""
+    if len(meshes) != len(at):
+        raise click.UsageError("--mesh FILE and --at JSON go together, one each")
+    if not (scans or meshes or towns):
+        raise click.UsageError("give at least one --scan, --mesh or --town")
+    from ilnet import survey as comparison
+    from ilnet.towns import NAMES
+
+    entries = comparison.survey(scans, zip(meshes, at, strict=True), NAMES if towns == ("all",) else towns)
+    found = json.dumps(comparison.records(entries), indent=1)
+    comparison.draw(entries, out / "survey.png")
+    (out / "survey.json").write_text(found + "\n")
+    click.echo(
+        found if as_json else f"{comparison.table(entries)}\n\nfigure and numbers: {out}/survey.png, survey.json"
+    )
+
+
 def _table(methods: dict[str, dict[str, Any]]) -> str:
     columns = {"mae": "MAE [m]", "iou": "IoU", "precision": "precision", "recall": "recall", "f1": "F1"}
     lines = [f"{'method':18}" + "".join(f"{title:>11}" for title in columns.values())]

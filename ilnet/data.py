@@ -1,4 +1,7 @@
-"""Training data: rays at continuous directions, cast while the network trains (paper, Sec. III-A: intractable)."""
+"""Training data: images stored on disk, and rays at continuous directions, cast while the network trains.
+
+The paper trains on the former and calls the latter intractable (Sec. III-A).
+"""
 
 import itertools
 import math
@@ -11,12 +14,13 @@ import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
 from ilnet import simulate, towns
+from ilnet.rimg import RangeImageTree
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, angles_to_directions
-from ilnet.store import open_archive
+from ilnet.store import Archive, open_archive
 from kernels import Mesh
 
-__all__ = ["Batch", "ContinuousRays", "Street", "held_out_scans", "open_archive", "street"]
+__all__ = ["Batch", "ContinuousRays", "StoredImages", "Street", "held_out_scans", "open_archive", "street"]
 
 # Metres above the lane, and how it varies from car to car.
 SENSOR_HEIGHT = 1.8

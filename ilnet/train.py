@@ -75,7 +75,7 @@ class Training(lightning.LightningModule):
 
     def training_step(self, batch: data.Batch, index: int) -> torch.Tensor:
         """L1 between ranges scaled to [-1, 1]."""
-        predicted = self.model(batch.image, batch.queries, wrap=False)
+        predicted = self.model(batch.image, batch.queries, wrap=batch.wrap)
         loss = (predicted - batch.ranges).abs().mean() * (2 / self.model.norm_range)
         self.log("loss", loss, prog_bar=True)
         return loss

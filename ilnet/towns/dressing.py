@@ -1,16 +1,21 @@
 """What lines the streets and stands on them: lamps, trees, signs, wires, and where one may park and walk."""
 
+from itertools import pairwise
+
 import numpy as np
 
-from ilnet.towns import furniture, plants
+from ilnet.towns import furniture, plants, structures
 from ilnet.towns.parts import Part
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Street
 
-__all__ = ["dress_street", "greenery", "plant_fields", "signals"]
+__all__ = ["Greens", "dress_street", "greenery", "plant_fields", "signals"]
 
 
-def greenery(rng: np.random.Generator) -> dict[str, list[Part]]:
+Greens = dict[str, list[Part]]
+
+
+def greenery(rng: np.random.Generator) -> Greens:
     """Prototypes of plants: of the street ("tall"), of gardens ("small"), of the distance ("far"), and others."""
     return {
         "tall": [
@@ -34,17 +39,23 @@ def _pick(parts: list[Part], rng: np.random.Generator) -> Part:
     return parts[int(rng.integers(0, len(parts)))]
 
 
-def _spread(street: Street, right: float, first: float, step: float, jitter: float, rng: np.random.Generator):
+def _spread(
+    street: Street, right: float, first: float, step: float, jitter: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Stations along a street at a lateral offset: points (N, 2) and headings (N,)."""
     s = np.arange(first, street.length - 2, step)
     return street.at(s + rng.uniform(-jitter, jitter, len(s)), right)
 
 
-def dress_street(site: Site, street: Street, greens: dict[str, list[Part]], rng: np.random.Generator) -> None:
+def dress_street(site: Site, street: Street, greens: Greens, rng: np.random.Generator) -> None:
     """Furnish both pavements, the kerbside parking and the median of a street."""
+    if street.frontage == "highway":
+        _dress_highway(site, street, greens, rng)
+        return
     ground = site.ground
-    open_country = street.frontage == "open"
-    for side in (1, -1):
+    busy = street.frontage in ("shops", "towers", "downtown", "old")
+    country = street.frontage in ("farms", "open")
+    for side in street.sides:
         inward = np.pi / 2 if side > 0 else -np.pi / 2  # turn from the heading to face the carriageway
         lamp = furniture.lamp(rng.uniform(6.0, 8.5), rng.uniform(1.0, 2.2))
         offset = side * (street.half + 0.5)
@@ -61,13 +72,15 @@ def dress_street(site: Site, street: Street, greens: dict[str, list[Part]], rng:
                 pick = keep & (kind == k)
                 site.put(part, xy[pick], heading[pick] + turn, size[pick])
 
-        stand([lamp], 9 if side > 0 else 24, 30, 0.95, offset, inward)
-        stand([furniture.sign(k) for k in range(4)], 14, 23, 0.7, offset, np.pi if side > 0 else 0.0)
+        if not country:
+            stand([lamp], 9 if side > 0 else 24, 30, 0.95, offset, inward)
+        signs = [furniture.sign(k) for k in range(4)]
+        stand(signs, 14, 60 if country else 23, 0.7, offset, np.pi if side > 0 else 0.0)
         wide = side * (street.half + street.pavement - 0.5)
-        if not open_country:
+        if not country:
             stand([furniture.bin_(False), furniture.bin_(True)], 20, 35, 0.6, wide, inward)
             _walks(site, street, side, rng)
-        if street.frontage in ("shops", "towers"):
+        if busy:
             stand([furniture.bench()], 16, 41, 0.7, wide, inward)
             stand([furniture.bollard()], 3, 2.2, 0.25, offset, 0.0)
             stand([furniture.bus_shelter()], 45, 150, 1.0, wide, inward)
@@ -76,6 +89,8 @@ def dress_street(site: Site, street: Street, greens: dict[str, list[Part]], rng:
             stand(trees, 7, rng.uniform(12, 18), 0.75, side * (street.half + 0.9), rng.uniform(0, 6), (0.95, 1.15))
         if street.parking:
             _parking(site, street, side, rng)
+        if country:
+            _verge(site, street, side, greens, rng)
     if street.median:
         s = np.arange(4, street.length - 4, 2.0)
         xy, _ = street.at(s, 0.0)
@@ -86,8 +101,65 @@ def dress_street(site: Site, street: Street, greens: dict[str, list[Part]], rng:
         hedge = plants.hedge(rng, 2.0, 0.8, 0.9)
         for k in np.nonzero(inside[:-1] & inside[1:] & (np.arange(len(s) - 1) % 24 < 14))[0]:
             site.run(hedge, 2.0, xy[k : k + 2])
-    if street.frontage in ("houses", "open", "rows") and rng.random() < 0.8:
+    if street.frontage in ("houses", "open", "rows", "cottages", "works", "farms", "hillside") and rng.random() < 0.8:
         _power_line(site, street, rng)
+
+
+def _dress_highway(site: Site, street: Street, greens: Greens, rng: np.random.Generator) -> None:
+    """Guard rails, a concrete barrier on the median, masts, gantries, posts and shrubs beside a highway."""
+
+    def line(right: float, first: float = 2.0, step: float = 4.0) -> tuple[np.ndarray, np.ndarray]:
+        return street.at(np.arange(first, street.length - 2, step), right)
+
+    for side in street.sides:
+        xy, heading = line(side * (street.half + 0.7))
+        site.run(structures.guard_rail(), 4.0, xy if side < 0 else xy[::-1], 0.45)
+        xy, heading = line(side * (street.half + 0.4), 10, 25)
+        site.put(furniture.bollard(), xy[site.ground.edge(xy) > 0.3], heading[0])
+        xy, heading = line(side * (street.half + 1.6), 30, 110)
+        clear = site.ground.edge(xy) > 1.0
+        site.put(furniture.sign(2, 2.9), xy[clear], heading[clear] + (np.pi if side > 0 else 0.0), 1.5)
+        xy, _ = street.at(np.arange(5, street.length - 5, 3.0), side * (street.half + rng.uniform(4, 9)))
+        for at in xy[(site.ground.edge(xy) > 2.5) & ~site.taken(xy) & (rng.random(len(xy)) < 0.4)]:
+            kind = str(rng.choice(["bush", "small", "far"], p=[0.6, 0.25, 0.15]))
+            site.put(_pick(greens[kind], rng), at + rng.uniform(-1.5, 1.5, 2), rng.uniform(0, 6), rng.uniform(0.8, 1.5))
+    if street.median:
+        xy, heading = line(0.0)
+        site.run(structures.concrete_barrier(), 4.0, xy, 0.5)
+        xy, heading = line(0.0, 20, 45)
+        for turn in (0.5, -0.5):
+            site.put(furniture.lamp(10.5, 2.4), xy, heading + turn * np.pi)
+        span = 2 * street.half + 2.4
+        for s in (0.27, 0.58, 0.82):
+            at, heading = street.at(np.array([s * street.length]), 0.0)
+            site.put_at(structures.gantry(span), [*at[0], float(site.ground.height(at)[0])], heading)
+
+
+def _verge(site: Site, street: Street, side: int, greens: Greens, rng: np.random.Generator) -> None:
+    """What bounds the fields along a lane, in stretches: walls, hedges, banks, fences, rows of trees, or nothing."""
+    s = street.tails[0]
+    while s < street.length - street.tails[1]:
+        length = rng.uniform(25, 70)
+        xy, _ = street.at(
+            np.arange(s, min(s + length, street.length), 4.0), side * (street.half + rng.uniform(1.7, 3.0))
+        )
+        kind = str(rng.choice(["wall", "hedge", "bank", "fence", "trees", "none"]))
+        panel = {
+            "wall": lambda: (structures.stone_wall(rng, rng.uniform(0.8, 1.3)), 3.0),
+            "hedge": lambda: (plants.hedge(rng, 4.0, rng.uniform(1.0, 2.2), rng.uniform(0.8, 1.4)), 4.0),
+            "bank": lambda: (structures.bank(rng.uniform(0.5, 1.1)), 4.0),
+            "fence": lambda: (structures.post_and_rail(), 2.5),
+        }.get(kind)
+        if panel:
+            for start, end in pairwise(xy):
+                middle = 0.5 * (start + end)
+                if not site.taken(np.array([start, middle, end])).any():
+                    site.run(*panel(), np.array([start, end]), 1.3)
+        if kind in ("trees", "bank"):
+            spots = xy[:: 2 if kind == "trees" else 3]
+            for at in spots[(site.ground.edge(spots) > 1.5) & ~site.taken(spots)]:
+                site.put(_pick(greens["tall"] + greens["far"], rng), at, rng.uniform(0, 6), rng.uniform(0.8, 1.1))
+        s += length + rng.uniform(4, 9)
 
 
 def _parking(site: Site, street: Street, side: int, rng: np.random.Generator) -> None:

@@ -65,7 +65,7 @@ def test_triangles_have_area(town):
     a, b, c = (town.vertices[town.triangles[:, k]].astype(np.float64) for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     assert area.min() > 1e-7
-    assert 250_000 < len(area) < 750_000
+    assert 300_000 < len(area) < 2_000_000
 
 
 def test_waypoints_follow_their_lane(town):
