@@ -17,11 +17,10 @@ import time
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -35,6 +34,8 @@ from kernels import Mesh
 
 __all__ = ["Place", "generate", "mesh_place", "sensors_of_sizes", "town_places"]
 
+T = TypeVar("T")
+
 # Metres and radians that poses vary by, besides their yaw, which is free.
 _HEIGHT_JITTER = 0.1
 _TILT_JITTER = math.radians(1.0)
@@ -45,10 +46,13 @@ _GROUND_WITHIN = 20.0
 class Place(NamedTuple):
     """Where scans can be taken."""
 
-    mesh: Mesh
-    waypoints: torch.Tensor
-    """(N, 3) float64 metres, on the ground."""
-    town: towns.Town | None
+    vertices: np.ndarray
+    """(V, 3) floating-point, metres."""
+    triangles: np.ndarray
+    """(F, 3) integer."""
+    waypoints: np.ndarray
+    """(N, 3) metres, on the ground."""
+    town: towns.Town | None = None
     """Whose traffic is drawn; None where there is none."""
 
 
@@ -74,9 +78,7 @@ def town_places(names: Iterable[str]) -> Places:
 
 def _build_town(name: str, seed: int) -> Place:
     town = towns.build(name, seed)
-    return Place(
-        Mesh(town.vertices, town.triangles, simulate.best_device()), torch.tensor(town.waypoints).double(), town
-    )
+    return Place(town.vertices, town.triangles, town.waypoints, town)
 
 
 def mesh_place(file: Path, positions: Path) -> Places:
@@ -98,16 +100,16 @@ def mesh_place(file: Path, positions: Path) -> Places:
         raise ValueError(
             f'{positions}: should be JSON like {{"positions": [[x, y, z], ...]}}, finite metres in the mesh'
         ) from None
-    mesh = Mesh(*meshes.read(file), simulate.best_device())
-    down = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64, device=mesh.device)
-    ground = mesh.cast(at.to(mesh.device), down, _GROUND_WITHIN).range.cpu()
+    vertices, triangles = meshes.read(file)
+    down = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
+    ground = Mesh(vertices, triangles).cast(at, down, _GROUND_WITHIN).range
     for number in (ground == 0).nonzero()[:1, 0].tolist():
         x, y, z = at[number].tolist()
         raise ValueError(
             f"{file}: no triangle under position {number} ({x:g}, {y:g}, {z:g}) within {_GROUND_WITHIN:g} m; "
             "move it or leave it out"
         )
-    place = Place(mesh, at - torch.tensor([0, 0, SENSOR_HEIGHT]), None)
+    place = Place(vertices, triangles, at.numpy() - [0, 0, SENSOR_HEIGHT])
     # Another mesh or other positions under the same name are another archive.
     digest = hashlib.sha256(file.read_bytes() + positions.read_bytes()).hexdigest()
     return {f"{file.name}@{digest[:16]}": lambda: place}
@@ -160,8 +162,8 @@ def generate(
             raise ValueError(f"two sensors have {size} rays; give each an archive of its own")
         sizes[size] = sensor
     workers = workers or torch.get_num_threads()
-    device = simulate.best_device().type
-    attributes = {"towns": list(places), "seed": seed, "device": device, "version": version("ilnet")}
+    device = simulate.best_device()
+    attributes = {"towns": list(places), "seed": seed, "device": device.type, "version": version("ilnet")}
     archive = Archive.create(out, scans, sizes, attributes)
     part, parts = shard
     units = {unit for unit in range(-(-scans // UNIT)) if unit % parts == part - 1}
@@ -171,13 +173,17 @@ def generate(
     total = sum(len(plan.scans(unit)) for unit in units)
     todo = sum(len(plan.scans(unit)) for unit in missing)
     needed = sorted({plan.town(k) for unit in missing for k in plan.scans(unit)})
-    for number in tqdm(needed, desc="towns", unit=" towns", leave=False, disable=not needed):
-        plan.places[number] = list(places.values())[number]()
-        # Compiles the kernels and sorts the triangles, once for all workers.
-        plan.images(plan.first[number])
+    builders = list(places.values())
+    with (
+        tqdm(total=len(needed), desc="towns", unit=" towns", leave=False, disable=not needed) as progress,
+        contextlib.closing(_parallel(lambda number: (number, builders[number]()), needed, workers)) as built,
+    ):
+        for number, place in built:
+            plan.add(number, place, Mesh(place.vertices, place.triangles, device))
+            progress.update()
     with tqdm(total=total, initial=total - todo, desc=str(out), unit=" scans") as progress:
         start, done = time.perf_counter(), 0
-        with contextlib.closing(_run(plan, missing, 1 if device == "cuda" else workers)) as counts:
+        with contextlib.closing(_parallel(plan.do, missing, 1 if device.type == "cuda" else workers)) as counts:
             for count in counts:
                 done += count
                 rate = done * rays / (time.perf_counter() - start) / 1e6
@@ -187,17 +193,21 @@ def generate(
     return archive
 
 
-@dataclass
 class _Plan:
-    """What each scan of an archive is."""
+    """What each scan of an archive is, once its town was added."""
 
-    archive: Archive
-    seed: int
+    def __init__(self, archive: Archive, seed: int):
+        self.archive, self.seed = archive, seed
+        count = len(archive.towns)
+        self._first = [len(archive) * number // count for number in range(count)]
+        self._places: dict[int, Place] = {}
+        self._meshes: dict[int, Mesh] = {}
 
-    def __post_init__(self) -> None:
-        self.places: dict[int, Place] = {}
-        towns, scans = len(self.archive.towns), len(self.archive)
-        self.first = [scans * number // towns for number in range(towns)]
+    def add(self, number: int, place: Place, mesh: Mesh) -> None:
+        """Takes in the town of that number."""
+        self._places[number], self._meshes[number] = place, mesh
+        # Compiles the kernels and sorts the triangles, once for all workers.
+        self.images(self._first[number])
 
     def scans(self, unit: int) -> range:
         """Which scans a unit holds."""
@@ -205,25 +215,26 @@ class _Plan:
 
     def town(self, scan: int) -> int:
         """The number of a scan's town: those of one town follow each other, so that a unit needs few."""
-        return bisect.bisect_right(self.first, scan) - 1
+        return bisect.bisect_right(self._first, scan) - 1
 
     def waypoint(self, scan: int) -> int:
         """The number of a scan's waypoint: drawn without repetition until there are no more, then again."""
         town = self.town(scan)
-        turn, index = divmod(scan - self.first[town], count := len(self.places[town].waypoints))
+        turn, index = divmod(scan - self._first[town], count := len(self._places[town].waypoints))
         return int(np.random.default_rng([self.seed, town, turn, 2]).permutation(count)[index])
 
     def pose(self, scan: int) -> torch.Tensor:
         """The sensor's pose (4, 4)."""
         rng = np.random.default_rng([self.seed, scan, 1])
-        at = self.places[self.town(scan)].waypoints[self.waypoint(scan)].clone()
+        at = torch.tensor(self._places[self.town(scan)].waypoints[self.waypoint(scan)], dtype=torch.float64)
         at[2] += SENSOR_HEIGHT + rng.uniform(-_HEIGHT_JITTER, _HEIGHT_JITTER)
         return simulate.pose(at, rng.uniform(-math.pi, math.pi), *rng.uniform(-_TILT_JITTER, _TILT_JITTER, 2))
 
     def images(self, scan: int) -> dict[str, np.ndarray]:
         """What each sensor measures, (H, W) uint16, as the archive stores it."""
         sensors = self.archive.sensors
-        found = _cast(self.places[self.town(scan)], list(sensors.values()), self.pose(scan), [self.seed, scan])
+        mesh, town = self._meshes[self.town(scan)], self._places[self.town(scan)].town
+        found = _cast(mesh, town, list(sensors.values()), self.pose(scan), [self.seed, scan])
         return {size: self.archive.quantise(size, image) for size, image in zip(sensors, found, strict=True)}
 
     def do(self, unit: int) -> int:
@@ -240,42 +251,44 @@ class _Plan:
         return len(scans)
 
 
-def _cast(place: Place, sensors: list[Sensor], pose: torch.Tensor, seed: list[int]) -> list[torch.Tensor]:
-    """The ranges (H, W) [m] that each sensor measures at a pose, among traffic of that seed."""
-    world = [place.mesh]
-    if place.town is not None:
-        vertices, triangles = towns.traffic(place.town, pose[:3, 3].numpy(), seed)
+def _cast(
+    mesh: Mesh, town: towns.Town | None, sensors: list[Sensor], pose: torch.Tensor, seed: list[int]
+) -> list[torch.Tensor]:
+    """The ranges (H, W) [m] that each sensor measures at a pose, among a town's traffic of that seed."""
+    world = [mesh]
+    if town is not None:
+        vertices, triangles = towns.traffic(town, pose[:3, 3].numpy(), seed)
         if len(triangles):
-            world.append(Mesh(vertices, triangles, place.mesh.device))
+            world.append(Mesh(vertices, triangles, mesh.device))
     # On CUDA the traffic must outlive the rays, so they are waited for.
     return [simulate.ranges(world, sensor, pose).cpu() for sensor in sensors]
 
 
-def _run(plan: _Plan, units: list[int], workers: int) -> Generator[int]:
-    """Does units, and yields the number of scans of each as soon as it is done."""
-    if workers == 1 or len(units) < 2:
-        yield from map(plan.do, units)
+def _parallel(function: Callable[[int], T], numbers: list[int], workers: int) -> Generator[T]:
+    """Yields what a function returns for each number, as soon as it does, from processes that share all memory."""
+    if workers == 1 or len(numbers) < 2:
+        yield from map(function, numbers)
         return
-    # Forked, so that all share the towns built here.
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _begin, (plan, os.getpid()))
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _begin, (function, os.getpid()))
     try:
-        for future in as_completed([pool.submit(_do, unit) for unit in units]):
+        for future in as_completed([pool.submit(_call, number) for number in numbers]):
             yield future.result()
     except BrokenProcessPool:
         raise ChildProcessError(
-            f"{plan.archive.path}: a worker died, perhaps for lack of memory; what is complete is kept: run the same "
-            "again, with fewer --workers"
+            "a worker died, perhaps for lack of memory; what is complete is kept: run the same again, with fewer "
+            "--workers"
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-_inherited: _Plan
+# What a worker inherited; it cannot be sent.
+_function: Callable[[int], Any]
 
 
-def _begin(plan: _Plan, parent: int) -> None:
-    global _inherited
-    _inherited = plan
+def _begin(function: Callable[[int], Any], parent: int) -> None:
+    global _function
+    _function = function
     torch.set_num_threads(1)
     # Ctrl-C reaches all: workers end without a word, and the parent says it.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -289,5 +302,5 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _do(unit: int) -> int:
-    return _inherited.do(unit)
+def _call(number: int) -> Any:
+    return _function(number)

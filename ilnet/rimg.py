@@ -48,13 +48,13 @@ class RangeImageTree:
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        found = [file for file in self.path.rglob("*.rimg") if _NAME.fullmatch("/".join(file.parts[-2:]))]
+        # A town, towns, or a folder that holds the whole download.
+        files = (file for above in ("", "*/", "*/*/") for file in self.path.glob(f"{above}*_*/*.rimg"))
+        found = [file for file in files if _NAME.fullmatch("/".join(file.parts[-2:]))]
         if not found:
             raise FileNotFoundError(f"{path}: holds no scans named like Town01/64_1024/1.rimg")
         folders = {file.parent.parent for file in found}
-        names = {folder: folder.resolve().relative_to(self.path.resolve().parent).parts for folder in folders}
-        # Below the folder that was named; a town that was named itself keeps its name.
-        towns = {folder: "/".join(parts[1:] or parts) for folder, parts in names.items()}
+        towns = {f: f.relative_to(self.path).as_posix() if f != self.path else f.resolve().name for f in folders}
         self.towns = tuple(sorted(towns.values()))
         self._scans = sorted({(towns[file.parent.parent], int(file.stem), file.parent.parent) for file in found})
         shapes = {tuple(map(int, file.parent.name.split("_"))) for file in found}
@@ -63,7 +63,7 @@ class RangeImageTree:
 
     @cached_property
     def _specification(self) -> dict[str, float]:
-        town = self._scans[0][2].resolve()
+        town = self._scans[0][2].absolute()
         file = next((f for f in (folder / _SPECIFICATION for folder in town.parents) if f.is_file()), None)
         if file is None:
             raise FileNotFoundError(

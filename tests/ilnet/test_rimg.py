@@ -71,6 +71,15 @@ def test_a_town_or_a_folder_above_will_do_too(tree):
     assert (len(above), above.towns) == (3, ("download/Town01", "download/Town02"))
 
 
+def test_towns_may_be_links(tree, tmp_path):
+    (tmp_path / "links").mkdir()
+    (tmp_path / "links" / "here").symlink_to(tree / "Town01")
+    shutil.copy(tree / "lidar_specification.yaml", tmp_path / "links")
+    scans = open_archive(tmp_path / "links")
+    assert (len(scans), scans.towns) == (2, ("here",))
+    assert scans.scan(0, "4x32").ranges.any()
+
+
 def test_a_size_may_be_missing_from_some_scans(tree):
     (tree / "Town01" / "8_32" / "10.rimg").unlink()
     scans = open_archive(tree)
