@@ -69,12 +69,16 @@ def demo(
 @click.option("--preset", default="tiny", show_default=True, help="Size of the network and of its training.")
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps, instead of the preset's.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of weights and rays.")
+@click.option("--data", type=Path, metavar="DIR", help="Learn from stored images: an archive or a tree of .rimg files.")
 @click.option("--out", type=Path, default=Path("runs"), show_default=True, help="Folder for weights, figures, logs.")
-def train(model: str, preset: str, steps: int | None, seed: int, out: Path) -> None:
-    """Train MODEL on rays cast at continuous directions; goes on where an interrupted run in --out stopped."""
+def train(model: str, preset: str, steps: int | None, seed: int, data: Path | None, out: Path) -> None:
+    """Train MODEL on rays cast at continuous directions; goes on where an interrupted run in --out stopped.
+
+    `torchrun --nproc-per-node N -m ilnet train MODEL` shares each batch among N processes or GPUs.
+    """
     from ilnet import train as training
 
-    figures = training.train(model, preset, out, steps, seed)
+    figures = training.train(model, preset, out, steps, seed, data)
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
 
 
@@ -170,12 +174,25 @@ def survey(
     from ilnet.towns import NAMES
 
     entries = comparison.survey(scans, zip(meshes, at, strict=True), NAMES if towns == ("all",) else towns)
-    found = json.dumps(comparison.records(entries), indent=1)
+    found = "[\n" + ",\n".join(map(json.dumps, comparison.records(entries))) + "\n]"
     comparison.draw(entries, out / "survey.png")
     (out / "survey.json").write_text(found + "\n")
     click.echo(
         found if as_json else f"{comparison.table(entries)}\n\nfigure and numbers: {out}/survey.png, survey.json"
     )
+
+
+@cli.command()
+@click.option(
+    "--town", "names", multiple=True, metavar="NAME", help="Draw this town; may be repeated. All unless told."
+)
+@click.option("--out", type=Path, default=Path("towns_output"), show_default=True, help="Folder for the pictures.")
+def towns(names: tuple[str, ...], out: Path) -> None:
+    """Draw the procedural towns: from above, from the street, and one scan of each."""
+    from ilnet.towns import NAMES, pictures
+
+    for path in pictures.draw(list(names or NAMES), out):
+        click.echo(path)
 
 
 def _table(methods: dict[str, dict[str, Any]]) -> str:

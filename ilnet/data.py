@@ -20,7 +20,17 @@ from ilnet.sensor import Sensor, angles_to_directions
 from ilnet.store import Archive, open_archive
 from kernels import Mesh
 
-__all__ = ["Batch", "ContinuousRays", "StoredImages", "Street", "held_out_scans", "open_archive", "street"]
+__all__ = [
+    "Archive",
+    "Batch",
+    "ContinuousRays",
+    "RangeImageTree",
+    "StoredImages",
+    "Street",
+    "held_out_scans",
+    "open_archive",
+    "street",
+]
 
 # Metres above the lane, and how it varies from car to car.
 SENSOR_HEIGHT = 1.8

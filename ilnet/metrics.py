@@ -4,7 +4,10 @@ import torch
 
 from ilnet.scan import Scan
 
-__all__ = ["VOXEL", "compare", "voxels"]
+__all__ = ["NAMES", "VOXEL", "compare", "voxels"]
+
+# What `compare` returns.
+NAMES = ("mae", "iou", "precision", "recall", "f1")
 
 # Metres: edge length of the voxels (paper, Sec. III-B).
 VOXEL = 0.1

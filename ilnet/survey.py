@@ -2,8 +2,9 @@
 
 What a scan looks like depends on its rays at least as much as on what stands around them. So towns and meshes are
 scanned with the very rays of each measured scan: with its beam tables, its range limits, at the height above the ground
-that it shows itself, and with the range noise of `NOISE`. Returns beyond a sensor's maximum range count as none, and
-pixels with a return nearer than its minimum range are left out: there the sensor sees what carries it.
+that it shows itself, and with the range noise of `NOISE`; no return is lost. Returns beyond a sensor's maximum range
+count as none, and pixels with a return nearer than its minimum range are left out: there the sensor sees what carries
+it.
 
 Measured scans are not levelled: a tilted sensor sees tilted ground.
 """
@@ -27,8 +28,8 @@ from kernels import Mesh
 
 __all__ = ["Entry", "Statistics", "draw", "ground_height", "records", "statistics", "survey", "table"]
 
-NOISE = Effects(range_noise=0.02)
-"""Of simulated scans: the precision that data sheets of spinning LiDARs state."""
+NOISE = Effects(range_noise=0.01, range_noise_growth=0.0005)
+"""Of simulated scans: what ranges along smooth surfaces of measured ones scatter, 1 to 2 cm near and 3 to 6 cm far."""
 RANGE_BINS = tuple(range(0, 81, 2))
 """Borders of the histogram of ranges [m]."""
 SLOPE_BINS = tuple(range(0, 91, 5))
@@ -283,20 +284,25 @@ def _examined(source: Path | str, scan: Scan) -> Statistics:
 
 def records(entries: Iterable[Entry]) -> list[dict[str, Any]]:
     """Returns what JSON holds of each entry: how many scans, the summary (mean, lowest, highest), the histograms."""
+
+    def rounded(values: Iterable[float]) -> list[float]:
+        return [round(value, 4) for value in values]
+
     found = []
     for entry in entries:
         summaries = [scan.summary() for scan in entry.scans]
+        columns = {key: [summary[key] for summary in summaries] for key in _TITLES}
         found.append(
             {
                 "sensor": entry.sensor,
                 "source": entry.source,
                 "kind": entry.kind,
                 "scans": len(entry.scans),
-                "mean": entry.mean.summary(),
-                "lowest": {key: min(summary[key] for summary in summaries) for key in summaries[0]},
-                "highest": {key: max(summary[key] for summary in summaries) for key in summaries[0]},
-                "ranges": {"borders_m": RANGE_BINS, "shares": entry.mean.ranges},
-                "slopes": {"borders_deg": SLOPE_BINS, "shares": entry.mean.slopes},
+                "mean": dict(zip(columns, rounded(map(np.mean, columns.values())), strict=True)),
+                "lowest": dict(zip(columns, rounded(map(min, columns.values())), strict=True)),
+                "highest": dict(zip(columns, rounded(map(max, columns.values())), strict=True)),
+                "ranges": {"borders_m": RANGE_BINS, "shares": rounded(entry.mean.ranges)},
+                "slopes": {"borders_deg": SLOPE_BINS, "shares": rounded(entry.mean.slopes)},
             }
         )
     return found

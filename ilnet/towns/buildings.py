@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike
 from ilnet.towns.furniture import railing
 from ilnet.towns.parts import Part, boxes, loft, merge, place, quads, shift, tubes
 
-__all__ = ["barn", "block", "church", "hall", "house", "shed", "wall"]
+__all__ = ["barn", "block", "church", "hall", "house", "shed", "tower", "wall"]
 
 _FOOTING = 4.0  # walls go this deep, so that sloping ground never opens a gap [m]
 _SEEN = 24.0  # no ray of a street LiDAR meets a wall higher than this within its range [m]
@@ -468,3 +468,30 @@ def church(rng: np.random.Generator) -> Part:
     buttresses = boxes(low, np.add(low, (0.9, 0.6, height - 0.5)))
     steps = boxes([[-3, -1.8, -0.6], [-2.6, -1.2, -0.6]], [[3, 0, 0.15], [2.6, 0, 0.3]])
     return merge([tower, spire, steps, shift(merge([_around(nave, width, depth), roof, buttresses]), y=side - 0.5)])
+
+
+def tower(rng: np.random.Generator, width: float, depth: float, floors: int, ground_floor: str) -> Part:
+    """A tower that stands back on a podium of shops; above what rays reach it is a shaft with bands.
+
+    Args:
+        rng: source of the variety.
+        width: along the street, metres.
+        depth: metres.
+        floors: storeys in all.
+        ground_floor: as for `block`.
+    """
+    podium = block(rng, width, depth, int(rng.integers(2, 6)), ground_floor, "flat")
+    base = float(podium.vertices[:, 2].max())
+    top, inset = 3.2 * floors, rng.uniform(1.5, 4.0, 3)
+    low, high = (
+        np.array([-width / 2 + inset[0], inset[1], 5.0]),
+        np.array([width / 2 - inset[0], depth - inset[2], top]),
+    )
+    z = np.arange(base + 0.5, top, rng.choice([3.2, 6.4, 9.6]))[:, None]
+    out = np.array([0.25, 0.25, 0.0])
+    bands = boxes(
+        np.column_stack([np.repeat((low - out)[None, :2], len(z), 0), z]),
+        np.column_stack([np.repeat((high + out)[None, :2], len(z), 0), z + 0.9]),
+    )
+    cap = boxes([low[0] + 3, low[1] + 3, top], [high[0] - 3, high[1] - 3, top + rng.uniform(2, 5)])
+    return merge([podium, boxes(low, high), bands, cap])

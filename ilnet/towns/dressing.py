@@ -19,17 +19,17 @@ def greenery(rng: np.random.Generator) -> Greens:
     """Prototypes of plants: of the street ("tall"), of gardens ("small"), of the distance ("far"), and others."""
     return {
         "tall": [
-            plants.tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 500, (0.22, 0.42), twigs=3)
+            plants.tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 750, (0.18, 0.38), twigs=3)
             for _ in range(5)
         ],
         "small": [
-            plants.tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 340, (0.17, 0.35)) for _ in range(4)
+            plants.tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 440, (0.16, 0.33)) for _ in range(4)
         ],
         "bare": [plants.tree(rng, rng.uniform(7, 10), rng.uniform(2.2, 3.0), 3.3, 0, (0, 0)) for _ in range(2)],
         "conifer": [plants.conifer(rng, rng.uniform(6, 11), 420) for _ in range(2)],
         "bush": [plants.bush(rng, rng.uniform(0.6, 1.1), 110) for _ in range(4)],
         "far": [
-            plants.tree(rng, rng.uniform(9, 14), rng.uniform(3.2, 4.5), 1.5, 230, (0.55, 0.9), twigs=0)
+            plants.tree(rng, rng.uniform(9, 14), rng.uniform(3.2, 4.5), 1.5, 420, (0.4, 0.75), twigs=1)
             for _ in range(3)
         ],
     }
@@ -107,6 +107,7 @@ def dress_street(site: Site, street: Street, greens: Greens, rng: np.random.Gene
 
 def _dress_highway(site: Site, street: Street, greens: Greens, rng: np.random.Generator) -> None:
     """Guard rails, a concrete barrier on the median, masts, gantries, posts and shrubs beside a highway."""
+    ground = site.ground
 
     def line(right: float, first: float = 2.0, step: float = 4.0) -> tuple[np.ndarray, np.ndarray]:
         return street.at(np.arange(first, street.length - 2, step), right)
@@ -115,24 +116,25 @@ def _dress_highway(site: Site, street: Street, greens: Greens, rng: np.random.Ge
         xy, heading = line(side * (street.half + 0.7))
         site.run(structures.guard_rail(), 4.0, xy if side < 0 else xy[::-1], 0.45)
         xy, heading = line(side * (street.half + 0.4), 10, 25)
-        site.put(furniture.bollard(), xy[site.ground.edge(xy) > 0.3], heading[0])
+        site.put(furniture.bollard(), xy[ground.edge(xy) > 0.3], heading[0])
         xy, heading = line(side * (street.half + 1.6), 30, 110)
-        clear = site.ground.edge(xy) > 1.0
+        clear = ground.edge(xy) > 1.0
         site.put(furniture.sign(2, 2.9), xy[clear], heading[clear] + (np.pi if side > 0 else 0.0), 1.5)
         xy, _ = street.at(np.arange(5, street.length - 5, 3.0), side * (street.half + rng.uniform(4, 9)))
-        for at in xy[(site.ground.edge(xy) > 2.5) & ~site.taken(xy) & (rng.random(len(xy)) < 0.4)]:
+        for at in xy[(ground.edge(xy) > 2.5) & ~site.taken(xy) & (rng.random(len(xy)) < 0.4)]:
             kind = str(rng.choice(["bush", "small", "far"], p=[0.6, 0.25, 0.15]))
             site.put(_pick(greens[kind], rng), at + rng.uniform(-1.5, 1.5, 2), rng.uniform(0, 6), rng.uniform(0.8, 1.5))
     if street.median:
         xy, heading = line(0.0)
         site.run(structures.concrete_barrier(), 4.0, xy, 0.5)
         xy, heading = line(0.0, 20, 45)
+        inside = ground.edge(xy) > 0.5
         for turn in (0.5, -0.5):
-            site.put(furniture.lamp(10.5, 2.4), xy, heading + turn * np.pi)
+            site.put(furniture.lamp(10.5, 2.4), xy[inside], heading[inside] + turn * np.pi)
         span = 2 * street.half + 2.4
         for s in (0.27, 0.58, 0.82):
             at, heading = street.at(np.array([s * street.length]), 0.0)
-            site.put_at(structures.gantry(span), [*at[0], float(site.ground.height(at)[0])], heading)
+            site.put_at(structures.gantry(span), [*at[0], float(ground.height(at)[0])], heading)
 
 
 def _verge(site: Site, street: Street, side: int, greens: Greens, rng: np.random.Generator) -> None:
@@ -221,7 +223,7 @@ def _power_line(site: Site, street: Street, rng: np.random.Generator) -> None:
 
 def _in_sight(site: Site, xy: np.ndarray) -> np.ndarray:
     """Whether points (N, 2) are within a LiDAR's reach of some street."""
-    road = np.concatenate([street.line[::5] for street in site.ground.streets])
+    road = np.concatenate([street.core[::5] for street in site.ground.streets])
     return np.linalg.norm(xy[:, None] - road, axis=-1).min(1) < 85
 
 
@@ -236,10 +238,10 @@ def plant_fields(site: Site, greens: dict[str, list[Part]], radius: float, rng: 
     for at in ring:
         if site.free(at[None], 8.0):
             site.put(_pick(greens["far"], rng), at, rng.uniform(0, 6), rng.uniform(0.7, 1.2))
-    spots = rng.uniform(-0.95 * radius, 0.95 * radius, (500, 2))
+    spots = rng.uniform(-0.95 * radius, 0.95 * radius, (1600, 2))
     spots = spots[(site.ground.edge(spots) > 6) & ~site.taken(spots) & _in_sight(site, spots)]
-    for at in spots[:50]:
-        around = at + 3 * np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
-        if not site.taken(around).any():
-            kind = str(rng.choice(["small", "bush", "conifer", "far", "bare"], p=[0.3, 0.3, 0.1, 0.25, 0.05]))
+    around = 3 * np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
+    for at in spots[:170]:
+        if not site.taken(at + around).any():
+            kind = str(rng.choice(["small", "bush", "conifer", "far", "bare"], p=[0.35, 0.25, 0.1, 0.25, 0.05]))
             site.put(_pick(greens[kind], rng), at, rng.uniform(0, 6), rng.uniform(0.8, 1.3))

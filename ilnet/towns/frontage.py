@@ -189,7 +189,10 @@ def _old_block(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random
 def _tower(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:
     """An office tower or a large block over shops and arcades."""
     ground_floor = str(rng.choice(["shops", "arcade", "passage"], p=[0.45, 0.4, 0.15]))
-    site.put(buildings.block(rng, size.width, size.depth, size.floors, ground_floor, "flat"), lot.origin, lot.yaw)
+    if size.floors > 9:
+        site.put(buildings.tower(rng, size.width, size.depth, size.floors, ground_floor), lot.origin, lot.yaw)
+    else:
+        site.put(buildings.block(rng, size.width, size.depth, size.floors, ground_floor, "flat"), lot.origin, lot.yaw)
 
 
 def _villa(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:

@@ -204,6 +204,7 @@ def tram_line(site: Site, street: Street, rng: np.random.Generator) -> None:
     keep = site.ground.edge(xy) > 0.3
     arm = street.half + 0.45
     site.put(structures.tram_mast(arm), xy[keep], heading[keep] + np.pi / 2)
+    s = s[keep]
     for right in (-street.lanes[0], street.lanes[0]):
         over, _ = street.at(s, right)
         hooks = np.column_stack([over, site.ground.height(over) + 5.6])

@@ -13,6 +13,8 @@ from ilnet.towns.town import Town
 
 __all__ = ["Plan", "raise_town"]
 
+_MARGIN = 95.0  # metres of land around the town: a little more than a LiDAR's reach
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -43,8 +45,8 @@ def raise_town(plan: Plan, name: str, seed: int, waypoints: int) -> Town:
     rng = np.random.default_rng([int(name[-2:]), seed])
     streets = plan.streets(rng)
     lines = list(streets.values())
-    reach = max(np.abs(s.line).max() for s in lines)
-    site = Site(Ground(lines, reach + 15, rng, plan.steepness, plan.kerb))
+    reach = max(np.abs(s.core).max() for s in lines)
+    site = Site(Ground(lines, reach + _MARGIN, rng, plan.steepness, plan.kerb))
     greens = greenery(rng)
     plan.landmarks(site, streets, greens, rng)
     for street in lines:
@@ -52,5 +54,5 @@ def raise_town(plan: Plan, name: str, seed: int, waypoints: int) -> Town:
             build_lots(site, street, side, greens, rng)
     for street in lines:
         dress_street(site, street, greens, rng)
-    plant_fields(site, greens, reach - 45, rng)
+    plant_fields(site, greens, reach + 40, rng)
     return site.town(name, seed, waypoints)

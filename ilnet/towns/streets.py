@@ -11,11 +11,12 @@ __all__ = ["KERB", "Draft", "Ground", "Street", "inside"]
 KERB = 0.12
 _CELL = 4  # coarse ground cell [m]; the kerb is cut on a 1 m grid nested in it
 _FAR = 18.0  # distances to the kerb are kept up to here [m]
-_TAIL = 80.0  # a street that leaves the town goes on for a LiDAR's reach [m]
+_STEP = 2.0  # between the points of a centreline [m]
+_TAIL = 150.0  # a street that leaves the town goes on beyond a LiDAR's reach [m]
 _CORNER = 6.0  # blend of two kerb lines [m]; about a 5 m corner radius
 
 
-def _spline(points: np.ndarray, spacing: float = 2.0, closed: bool = False) -> np.ndarray:
+def _spline(points: np.ndarray, spacing: float = _STEP, closed: bool = False) -> np.ndarray:
     """A Catmull-Rom curve through points (N, 2), resampled to even steps of about `spacing` metres."""
     before, after = 2 * points[:1] - points[1:2], 2 * points[-1:] - points[-2:-1]
     if closed:
@@ -62,6 +63,12 @@ class Street:
     def ways(self) -> tuple[int, ...]:
         """Directions of travel: 1 along the line, -1 against it."""
         return (1,) if self.oneway else (1, -1)
+
+    @property
+    def core(self) -> np.ndarray:
+        """The line (M, 2) without its tails."""
+        first, last = (round(t / _STEP) for t in self.tails)
+        return self.line[first : len(self.line) - last]
 
     @property
     def length(self) -> float:
@@ -143,7 +150,7 @@ class Draft:
                 for end in (0, -1):
                     if np.hypot(*(others - line[end]).T).min() > 25:
                         way = line[end] - line[3 if end == 0 else -4]
-                        steps = np.arange(2.0, _TAIL + 1, 2.0)[:, None] * way / np.hypot(*way)
+                        steps = np.arange(_STEP, _TAIL + 1, _STEP)[:, None] * way / np.hypot(*way)
                         more = line[end] + steps
                         line = np.concatenate([more[::-1], line] if end == 0 else [line, more])
                         tails[end] = _TAIL
@@ -229,7 +236,7 @@ class Ground:
                 line = street.line[i : i + 11]
                 low = np.floor(line.min(0) - _FAR - street.half).astype(int) + self.extent
                 high = np.ceil(line.max(0) + _FAR + street.half).astype(int) + self.extent + 1
-                low, high = np.maximum(low, 0), np.minimum(high, n)
+                low, high = np.clip(low, 0, n), np.clip(high, 0, n)
                 x, y = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]), indexing="ij")
                 xy = np.stack([x.ravel(), y.ravel()], axis=1) - float(self.extent)
                 window = field[low[0] : high[0], low[1] : high[1]]
@@ -246,8 +253,12 @@ class Ground:
         return np.minimum(edge, _FAR)
 
     def edge(self, xy: np.ndarray) -> np.ndarray:
-        """Signed distance (N,) of points (N, 2) from the kerb, metres: negative on a carriageway, at most 18."""
-        return self._bilinear(self._edge, np.asarray(xy, dtype=np.float64) + self.extent)
+        """Signed distance (N,) of points (N, 2) from the kerb, metres: negative on a carriageway, at most 18.
+
+        Beyond the ground it is 0, so that nothing is put there.
+        """
+        at = np.asarray(xy, dtype=np.float64) + self.extent
+        return np.where((np.abs(at - self.extent) < self.extent).all(-1), self._bilinear(self._edge, at), 0.0)
 
     @staticmethod
     def _bilinear(raster: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ilnet.towns.dressing import Greens
-from ilnet.towns.landmarks import churchyard, noise_walls
+from ilnet.towns.landmarks import churchyard, fields, noise_walls
 from ilnet.towns.plan import Plan
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Draft, Street
@@ -53,9 +53,10 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
 
 
 def _landmarks(site: Site, streets: dict[str, Street], greens: Greens, rng: np.random.Generator) -> None:
-    """Walls that keep the noise from the settlement, and its church."""
+    """Walls that keep the noise from the settlement, its church, and fields."""
     noise_walls(site, streets["highway"], -1, 0.36, 0.66, rng)
     churchyard(site, streets["village"], 0.72, greens, rng)
+    fields(site, greens, rng)
 
 
 PLAN = Plan(_streets, _landmarks, steepness=0.04)
