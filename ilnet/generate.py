@@ -269,7 +269,8 @@ def _parallel(function: Callable[[int], T], numbers: list[int], workers: int) ->
     if workers == 1 or len(numbers) < 2:
         yield from map(function, numbers)
         return
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _begin, (function, os.getpid()))
+    pipe = os.pipe()
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _begin, (function, *pipe))
     try:
         for future in as_completed([pool.submit(_call, number) for number in numbers]):
             yield future.result()
@@ -279,26 +280,29 @@ def _parallel(function: Callable[[int], T], numbers: list[int], workers: int) ->
             "--workers"
         ) from None
     finally:
+        # Workers that are still at something end at once: a file that is not whole is no file.
+        os.close(pipe[1])
         pool.shutdown(cancel_futures=True)
+        os.close(pipe[0])
 
 
 # What a worker inherited; it cannot be sent.
 _function: Callable[[int], Any]
 
 
-def _begin(function: Callable[[int], Any], parent: int) -> None:
+def _begin(function: Callable[[int], Any], reading: int, writing: int) -> None:
     global _function
     _function = function
     torch.set_num_threads(1)
     # Ctrl-C reaches all: workers end without a word, and the parent says it.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    os.close(writing)
+    threading.Thread(target=_end_with, args=(reading,), daemon=True).start()
 
 
-def _end_with(parent: int) -> None:
-    # A parent that was killed cannot tell its workers.
-    while os.getppid() == parent:
-        time.sleep(0.2)
+def _end_with(reading: int) -> None:
+    # Comes back when no process holds the other end of the pipe: the parent closed it, or was killed.
+    os.read(reading, 1)
     os._exit(1)
 
 

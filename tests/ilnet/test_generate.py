@@ -178,10 +178,9 @@ def test_killed_three_times_it_ends_as_if_undisturbed(tmp_path, mesh_file):
     arguments += ["--sizes", "16x256,128x2048", "--out"]
     command = [sys.executable, "-m", "ilnet", "simulate", *map(str, arguments)]
 
-    def start(folder):
-        return subprocess.Popen(
-            [*command, folder], text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
-        )
+    def start(folder, *more):
+        pipe = subprocess.PIPE
+        return subprocess.Popen([*command, folder, *more], text=True, stdout=pipe, stderr=pipe, start_new_session=True)
 
     stops = [
         lambda run: os.kill(run.pid, signal.SIGKILL),
@@ -200,11 +199,12 @@ def test_killed_three_times_it_ends_as_if_undisturbed(tmp_path, mesh_file):
     assert "Traceback" not in said
     assert 0 < len(open_archive(out).missing()) < units
     (out / "pose" / "c" / "0" / "0" / "0.0123.partial").write_bytes(b"torn")
-    runs = [start(out), start(tmp_path / "undisturbed")]
+    # Two hosts go on together.
+    runs = [start(out, "--shard", "1/2"), start(out, "--shard", "2/2"), start(tmp_path / "undisturbed")]
     for run in runs:
-        said, errors = run.communicate()
+        said, errors = run.communicate(timeout=60)
         assert run.returncode == 0, errors
-        assert said.splitlines()[-1].endswith("47 scans of 16x256, 128x2048: complete")
+    assert said.splitlines()[-1].endswith("47 scans of 16x256, 128x2048: complete")
     assert "Mray/s" in errors
     assert files(out) == files(tmp_path / "undisturbed")
 
