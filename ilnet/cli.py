@@ -89,6 +89,7 @@ def train(model: str, preset: str, steps: int | None, seed: int, data: Path | No
 @click.option("--scans", type=click.IntRange(min=1), required=True, metavar="N", help="Poses to scan from, in all.")
 @click.option("--sizes", metavar="HxW", help=f"Of the paper's sensor, comma separated; {_SIZES} unless told.")
 @click.option("--sensor", metavar="NAMES", help="Presets, comma separated, instead of --sizes.")
+@click.option("--effect", "effects", multiple=True, metavar="NAME=VALUE", help="Such as range_noise=0.02.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of waypoints, poses, traffic.")
 @click.option("--shard", metavar="I/N", default="1/1", help="Do part I of N, for many hosts; merge by copying files.")
 @click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes on a CPU; all cores unless told.")
@@ -100,6 +101,7 @@ def simulate(
     scans: int,
     sizes: str | None,
     sensor: str | None,
+    effects: tuple[str, ...],
     seed: int,
     shard: str,
     workers: int | None,
@@ -128,7 +130,8 @@ def simulate(
     else:
         sensors = generate.sensors_of_sizes((sizes or _SIZES).split(","))
     try:
-        archive = generate.generate(out, places, scans, sensors, seed, (int(part), int(parts)), workers)
+        wanted = generate.effects_of(effects)
+        archive = generate.generate(out, places, scans, sensors, seed, (int(part), int(parts)), workers, wanted)
     except KeyboardInterrupt:
         click.echo(f"interrupted: what is complete stays in {out}; the same command goes on from there", err=True)
         raise

@@ -7,6 +7,7 @@ so the work may be shared out and interrupted in any way.
 import bisect
 import contextlib
 import hashlib
+import itertools
 import json
 import math
 import multiprocessing
@@ -17,6 +18,7 @@ import time
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, fields
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -27,18 +29,21 @@ import torch
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from ilnet import meshes, simulate, towns
-from ilnet.data import SENSOR_HEIGHT
+from ilnet.data import SENSOR_HEIGHT, Street
+from ilnet.effects import Effects
 from ilnet.sensor import PRESETS, Sensor, preset
 from ilnet.store import UNIT, Archive
 from kernels import Mesh
 
-__all__ = ["Place", "generate", "mesh_place", "sensors_of_sizes", "town_places"]
+__all__ = ["Place", "effects_of", "generate", "mesh_place", "sensors_of_sizes", "town_places"]
 
 T = TypeVar("T")
 
 # Metres and radians that poses vary by, besides their yaw, which is free.
 _HEIGHT_JITTER = 0.1
 _TILT_JITTER = math.radians(1.0)
+# Those that show in ranges.
+_EFFECTS = tuple(field.name for field in fields(Effects) if field.name != "intensity")
 # Metres below the sensor that the ground must lie within.
 _GROUND_WITHIN = 20.0
 
@@ -56,8 +61,8 @@ class Place(NamedTuple):
     """Whose traffic is drawn; None where there is none."""
 
 
-# How to build each.
-Places = dict[str, Callable[[], Place]]
+# For each how many waypoints it has, about, and how to build it.
+Places = dict[str, tuple[int, Callable[[], Place]]]
 
 
 def town_places(names: Iterable[str]) -> Places:
@@ -72,7 +77,7 @@ def town_places(names: Iterable[str]) -> Places:
             )
         if label in places:
             raise ValueError(f"--towns names {label} twice")
-        places[label] = partial(_build_town, name, int(seed or 0))
+        places[label] = towns.WAYPOINTS[name], partial(_build_town, name, int(seed or 0))
     return places
 
 
@@ -112,7 +117,7 @@ def mesh_place(file: Path, positions: Path) -> Places:
     place = Place(vertices, triangles, at.numpy() - [0, 0, SENSOR_HEIGHT])
     # Another mesh or other positions under the same name are another archive.
     digest = hashlib.sha256(file.read_bytes() + positions.read_bytes()).hexdigest()
-    return {f"{file.name}@{digest[:16]}": lambda: place}
+    return {f"{file.name}@{digest[:16]}": (len(at), lambda: place)}
 
 
 def sensors_of_sizes(sizes: Iterable[str]) -> list[Sensor]:
@@ -128,6 +133,22 @@ def sensors_of_sizes(sizes: Iterable[str]) -> list[Sensor]:
     return sensors
 
 
+def effects_of(settings: Iterable[str]) -> Effects | None:
+    """Returns the effects that settings such as "range_noise=0.02" or "velocity=10,0,0" name; None where there is none.
+
+    Raises:
+        ValueError: If a setting is of another kind.
+    """
+    values: dict[str, Any] = {}
+    for setting in settings:
+        name, _, value = setting.partition("=")
+        default = getattr(Effects(), name, None)
+        if name not in _EFFECTS:
+            raise ValueError(f"--effect is {setting!r}; it should be NAME=VALUE, with a name of: {', '.join(_EFFECTS)}")
+        values[name] = value.split(",") if isinstance(default, tuple) else value
+    return Effects(**values) if values else None
+
+
 def generate(
     out: Path,
     places: Places,
@@ -136,17 +157,19 @@ def generate(
     seed: int = 0,
     shard: tuple[int, int] = (1, 1),
     workers: int | None = None,
+    effects: Effects | None = None,
 ) -> Archive:
     """Simulates scans into an archive; goes on where an interrupted run stopped.
 
     Args:
         out: The archive's folder.
-        places: Where scans are taken, equally often; see `town_places` and `mesh_place`.
+        places: Where scans are taken, each waypoint equally often; see `town_places` and `mesh_place`.
         scans: Their number, of all parts.
         sensors: Each takes every scan, of the same world and from the same pose.
         seed: Of waypoints, poses and traffic.
         shard: (i, n): this run does part i of n, counted from 1.
         workers: Processes on a CPU; as many as torch has threads unless told. On CUDA this one does all.
+        effects: What real sensors do to their measurements.
 
     Returns:
         The archive, complete but for what belongs to other parts.
@@ -164,16 +187,18 @@ def generate(
     workers = workers or torch.get_num_threads()
     device = simulate.best_device()
     attributes = {"towns": list(places), "seed": seed, "device": device.type, "version": version("ilnet")}
+    if effects:
+        attributes["effects"] = asdict(effects)
     archive = Archive.create(out, scans, sizes, attributes)
     part, parts = shard
     units = {unit for unit in range(-(-scans // UNIT)) if unit % parts == part - 1}
     missing = [unit for unit in archive.missing() if unit in units]
-    plan = _Plan(archive, seed)
+    plan = _Plan(archive, seed, [count for count, _ in places.values()], effects)
     rays = sum(math.prod(sensor.shape) for sensor in sizes.values())
     total = sum(len(plan.scans(unit)) for unit in units)
     todo = sum(len(plan.scans(unit)) for unit in missing)
     needed = sorted({plan.town(k) for unit in missing for k in plan.scans(unit)})
-    builders = list(places.values())
+    builders = [build for _, build in places.values()]
     with (
         tqdm(total=len(needed), desc="towns", unit=" towns", leave=False, disable=not needed) as progress,
         contextlib.closing(_parallel(lambda number: (number, builders[number]()), needed, workers)) as built,
@@ -196,10 +221,10 @@ def generate(
 class _Plan:
     """What each scan of an archive is, once its town was added."""
 
-    def __init__(self, archive: Archive, seed: int):
-        self.archive, self.seed = archive, seed
-        count = len(archive.towns)
-        self._first = [len(archive) * number // count for number in range(count)]
+    def __init__(self, archive: Archive, seed: int, waypoints: list[int], effects: Effects | None):
+        self.archive, self.seed, self.effects = archive, seed, effects
+        before = itertools.accumulate(waypoints, initial=0)
+        self._first = [len(archive) * number // sum(waypoints) for number in before][:-1]
         self._places: dict[int, Place] = {}
         self._meshes: dict[int, Mesh] = {}
 
@@ -233,9 +258,11 @@ class _Plan:
     def images(self, scan: int) -> dict[str, np.ndarray]:
         """What each sensor measures, (H, W) uint16, as the archive stores it."""
         sensors = self.archive.sensors
-        mesh, town = self._meshes[self.town(scan)], self._places[self.town(scan)].town
-        found = _cast(mesh, town, list(sensors.values()), self.pose(scan), [self.seed, scan])
-        return {size: self.archive.quantise(size, image) for size, image in zip(sensors, found, strict=True)}
+        mesh, town, pose = self._meshes[self.town(scan)], self._places[self.town(scan)].town, self.pose(scan)
+        world = Street(town, mesh).world(pose[:3, 3], [self.seed, scan]) if town else [mesh]
+        chance = int(np.random.default_rng([self.seed, scan, 3]).integers(2**63))
+        found = {size: simulate.simulate(world, sensor, pose, self.effects, chance) for size, sensor in sensors.items()}
+        return {size: self.archive.quantise(size, measured.ranges) for size, measured in found.items()}
 
     def do(self, unit: int) -> int:
         """Simulates and writes a unit, and returns its number of scans."""
@@ -249,19 +276,6 @@ class _Plan:
             np.stack([self.pose(scan).numpy() for scan in scans]),
         )
         return len(scans)
-
-
-def _cast(
-    mesh: Mesh, town: towns.Town | None, sensors: list[Sensor], pose: torch.Tensor, seed: list[int]
-) -> list[torch.Tensor]:
-    """The ranges (H, W) [m] that each sensor measures at a pose, among a town's traffic of that seed."""
-    world = [mesh]
-    if town is not None:
-        vertices, triangles = towns.traffic(town, pose[:3, 3].numpy(), seed)
-        if len(triangles):
-            world.append(Mesh(vertices, triangles, mesh.device))
-    # On CUDA the traffic must outlive the rays, so they are waited for.
-    return [simulate.ranges(world, sensor, pose).cpu() for sensor in sensors]
 
 
 def _parallel(function: Callable[[int], T], numbers: list[int], workers: int) -> Generator[T]:

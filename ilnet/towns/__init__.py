@@ -5,7 +5,7 @@ from ilnet.towns.plan import raise_town
 from ilnet.towns.town import Town
 from ilnet.towns.traffic import traffic
 
-__all__ = ["NAMES", "TEST", "TRAIN", "Town", "build", "traffic"]
+__all__ = ["NAMES", "TEST", "TRAIN", "WAYPOINTS", "Town", "build", "traffic"]
 
 # plans, and how many waypoints to keep: 22,244 in the towns to train in and 2,847 in those to test in, as in the paper
 _TOWNS = {
@@ -20,6 +20,7 @@ _TOWNS = {
 }
 NAMES = tuple(_TOWNS)
 TRAIN, TEST = NAMES[:6], NAMES[6:]
+WAYPOINTS = {name: count for name, (_, count) in _TOWNS.items()}
 
 
 def build(name: str, seed: int = 0) -> Town:

@@ -17,6 +17,7 @@ import torch
 
 from ilnet import cli, generate, simulate, towns
 from ilnet.data import SENSOR_HEIGHT, open_archive
+from ilnet.data import street as street_of
 from ilnet.store import UNIT
 from kernels import Mesh
 
@@ -34,7 +35,7 @@ def yard():
 
 
 def make(out, seed=5, **how):
-    how = {"places": {"yard": yard, "yard again": yard}, "workers": 1, **how}
+    how = {"places": {"yard": (9, yard), "yard again": (9, yard)}, "workers": 1, **how}
     return generate.generate(out, scans=SCANS, sensors=generate.sensors_of_sizes(SIZES), seed=seed, **how)
 
 
@@ -84,22 +85,46 @@ def test_the_seed_decides(undisturbed, tmp_path):
     assert not torch.equal(other.scan(0, "4x64").ranges, undisturbed.scan(0, "4x64").ranges)
 
 
-def test_all_sizes_see_the_same_traffic_and_each_scan_its_own():
-    town = towns.build("town01")
-    far_below = torch.tensor([[-500.0, -500, -9], [500, -500, -9], [0, 500, -9]])
-    mesh = Mesh(far_below, torch.tensor([[0, 1, 2]]))
-    pose = simulate.pose(torch.tensor(town.waypoints[300]).double() + torch.tensor([0, 0, SENSOR_HEIGHT]))
+def test_all_sizes_see_the_same_traffic_and_each_scan_its_own(tmp_path):
     sensors = generate.sensors_of_sizes(["16x1024", "64x1024"])
-    sparse, dense = generate._cast(mesh, town, sensors, pose, [0, 1])
-    bare, _ = generate._cast(mesh, None, sensors, pose, [0, 1])
-    near = (sparse > 0) & ((bare == 0) | (sparse < bare - 0.01))
-    assert near.sum() > 50
-    assert not ((bare > 0) & (sparse > bare + 0.01)).any()
-    torch.testing.assert_close(dense[[0, 63]], sparse[[0, 15]], atol=1e-3, rtol=0)
-    assert not torch.equal(generate._cast(mesh, town, sensors, pose, [0, 2])[0], sparse)
+    archive = generate.generate(tmp_path / "scans", generate.town_places(["town01"]), 3, sensors, seed=4)
+    street = street_of("town01")
+    for number in range(3):
+        pose = archive.pose(number)
+        own, other = (street.world(pose[:3, 3], [4, k]) for k in (number, number + 1))
+        for size, sensor in archive.sensors.items():
+            ranges = archive.scan(number, size).ranges
+            difference = (ranges - simulate.ranges(own, sensor, pose)).abs()
+            assert difference.max() <= 0.001
+            assert ((ranges - simulate.ranges(other, sensor, pose)).abs() > 0.1).double().mean() > 1e-3
 
 
-@on_cpu
+def test_effects_are_those_of_each_scan(tmp_path):
+    effects = generate.effects_of(["range_noise=0.05", "velocity=1,0,0"])
+    noisy = make(tmp_path / "noisy", effects=effects)
+    clean = simulate.ranges(Mesh(*yard_triangles()), noisy.sensors["16x128"], noisy.pose(0))
+    error = [(noisy.scan(k, "16x128").ranges - clean) for k in (0, 1)]
+    seen = (clean > 0) & (noisy.scan(0, "16x128").ranges > 0)
+    assert 0.03 < error[0][seen].abs().median() < 0.2
+    assert not torch.equal(*error)
+    with pytest.raises(ValueError, match="holds another archive: its effects is"):
+        make(tmp_path / "noisy")
+    for wrong, message in (("fog=1", "--effect is 'fog=1'.*range_noise, "), ("dropout_range=2", "dropout_range is 2")):
+        with pytest.raises(ValueError, match=message):
+            generate.effects_of([wrong])
+
+
+def test_towns_take_scans_by_their_waypoints(tmp_path):
+    """So that as many scans as there are waypoints take every one once."""
+    built = yard()
+    fewer = built._replace(waypoints=built.waypoints[:3])
+    archive = make(tmp_path / "scans", places={"nine": (9, yard), "three": (3, lambda: fewer)})
+    count = [archive.town(k) for k in range(SCANS)].count("nine")
+    assert count == -(-SCANS * 9 // 12) or count == SCANS * 9 // 12
+    assert sum(towns.WAYPOINTS[name] for name in towns.TRAIN) == 22_244
+    assert sum(towns.WAYPOINTS[name] for name in towns.TEST) == 2_847
+
+
 def test_several_workers_do_the_same(undisturbed, tmp_path):
     many = make(tmp_path / "many", workers=3)
     assert files(many.path) == files(undisturbed.path)
@@ -127,9 +152,9 @@ def test_only_towns_that_are_needed_are_built(tmp_path, undisturbed):
     def never():
         raise AssertionError
 
-    make(out, places={"yard": yard, "yard again": never})
+    make(out, places={"yard": (9, yard), "yard again": (9, never)})
     assert files(out) == files(undisturbed.path)
-    make(out, places={"yard": never, "yard again": never})
+    make(out, places={"yard": (9, never), "yard again": (9, never)})
 
 
 def test_a_full_disk_stops_it_with_one_line_and_it_goes_on(tmp_path, undisturbed):
@@ -146,14 +171,14 @@ def test_a_full_disk_stops_it_with_one_line_and_it_goes_on(tmp_path, undisturbed
 
 @on_cpu
 def test_a_worker_that_dies_is_reported(tmp_path, undisturbed, monkeypatch):
-    parent, cast = os.getpid(), generate._cast
+    parent, images = os.getpid(), generate._Plan.images
 
-    def killed(*arguments):
-        if os.getpid() != parent and arguments[-1] == [5, 2 * UNIT]:
+    def killed(plan, scan):
+        if os.getpid() != parent and scan == 2 * UNIT:
             os.kill(os.getpid(), signal.SIGKILL)
-        return cast(*arguments)
+        return images(plan, scan)
 
-    monkeypatch.setattr(generate, "_cast", killed)
+    monkeypatch.setattr(generate._Plan, "images", killed)
     with pytest.raises(ChildProcessError, match=r"a worker died.* what is complete is kept"):
         make(tmp_path / "x", workers=2)
     monkeypatch.undo()
