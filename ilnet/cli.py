@@ -12,6 +12,20 @@ __all__ = ["main"]
 
 _SIZES = "16x1024,64x1024,128x2048,256x4096"
 
+
+class _Size(click.ParamType):
+    """Rows and columns of a range image."""
+
+    name = "ROWSxCOLUMNS"
+
+    def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> tuple[int, int]:
+        """Returns both numbers."""
+        rows, _, columns = str(value).partition("x")
+        if not (rows.isdecimal() and columns.isdecimal() and int(rows) >= 2 and int(columns) >= 2):
+            self.fail(f"{value!r} should be rows x columns, at least 2 of each, such as 128x2048", parameter, context)
+        return int(rows), int(columns)
+
+
 # The commands import what they need themselves, so that `--help` and a typing error answer at once.
 
 
@@ -48,11 +62,12 @@ def demo(
     if not scan and (rows is not None or sensor is not None):
         raise click.UsageError("--rows and --sensor go with --scan FILE")
     from ilnet import demo as demonstration
+    from ilnet import evaluate
 
     if mesh and at:
-        pair, source = demonstration.from_mesh(mesh, at), mesh.name
+        [pair], source = evaluate.mesh_pairs(mesh, [at], demonstration.OUTPUT), mesh.name
     elif scan:
-        pair, source = demonstration.from_scan(scan, 16 if rows is None else rows, sensor), scan.name
+        pair, source = evaluate.scan_pair(scan, 16 if rows is None else rows, sensor), scan.name
     else:
         pair, source = demonstration.from_town(), demonstration.TOWN
     result = demonstration.demo(*pair, out, source)
@@ -80,6 +95,64 @@ def train(model: str, preset: str, steps: int | None, seed: int, data: Path | No
 
     figures = training.train(model, preset, out, steps, seed, data)
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
+
+
+@cli.command("evaluate")
+@click.option("--model", "names", multiple=True, required=True, metavar="NAME|FILE", help="May be given repeatedly.")
+@click.option("--scene", metavar="TOWN|MESH", help="Scan this town, or this mesh file (metres, z up).")
+@click.option("--at", type=Path, metavar="FILE", help='Positions in the mesh: {"positions": [[x, y, z], ...]} [m].')
+@click.option("--scan", type=Path, metavar="FILE", help="Decimate this scan, and judge against all of its rows.")
+@click.option("--rows", type=int, metavar="N", help="Beams of the scan to keep; 16 unless told.")
+@click.option("--sensor", metavar="NAME", help="Preset with the scan's angles, where the file does not name them.")
+@click.option("--size", type=_Size(), help="Rays to predict in the scene; 128x2048 unless told.")
+@click.option("--scans", type=click.IntRange(min=1), help="Scans of the scene; 8, or all positions, unless told.")
+@click.option(
+    "--json", "as_json", is_flag=True, help="Print an object instead of the table, or a list for many models."
+)
+def evaluate_(
+    names: tuple[str, ...],
+    scene: str | None,
+    at: Path | None,
+    scan: Path | None,
+    rows: int | None,
+    sensor: str | None,
+    size: tuple[int, int] | None,
+    scans: int | None,
+    as_json: bool,
+) -> None:
+    """Measure models on scans of a scene, seen with 16x1024 rays, or on a measured scan."""
+    if bool(scene) == bool(scan):
+        raise click.UsageError("give --scene TOWN|MESH or --scan FILE")
+    if scan and (at or size or scans):
+        raise click.UsageError("--at, --size and --scans go with --scene; a scan is judged at its own size")
+    if scene and (rows is not None or sensor is not None):
+        raise click.UsageError("--rows and --sensor go with --scan FILE")
+    from ilnet import evaluate, models, towns
+
+    loaded = {name: models.load(name) for name in names}
+    output = evaluate.INPUT.resize(*(size or (128, 2048)))
+    if scan:
+        pairs = [evaluate.scan_pair(scan, 16 if rows is None else rows, sensor)]
+    elif scene in towns.NAMES:
+        if at:
+            raise click.UsageError("--at goes with a mesh; a town has its own waypoints")
+        pairs = evaluate.town_pairs(scene, scans or 8, output)
+    else:
+        mesh = Path(str(scene))
+        if not mesh.exists():
+            raise click.UsageError(f"--scene {scene} is neither a town ({', '.join(towns.NAMES)}) nor a mesh file")
+        if at is None:
+            raise click.UsageError("--scene MESH needs --at FILE, the positions of the sensor in the mesh")
+        positions = evaluate.read_positions(at)
+        if scans and scans > len(positions):
+            raise click.UsageError(f"--scans is {scans}, but {at} holds {len(positions)} positions")
+        pairs = evaluate.mesh_pairs(mesh, positions[:scans], output)
+    results = evaluate.evaluate(loaded, pairs)
+    if as_json:
+        click.echo(json.dumps(results[0] if len(results) == 1 else results))
+        return
+    click.echo(f"{scene or scan}: {len(pairs)} scan(s) -> {results[0]['size']}\n")
+    click.echo(_table({result["model"]: result for result in results}))
 
 
 @cli.command()
@@ -199,9 +272,18 @@ def towns(names: tuple[str, ...], out: Path) -> None:
 
 
 def _table(methods: dict[str, dict[str, Any]]) -> str:
-    columns = {"mae": "MAE [m]", "iou": "IoU", "precision": "precision", "recall": "recall", "f1": "F1"}
-    lines = [f"{'method':18}" + "".join(f"{title:>11}" for title in columns.values())]
-    lines += [f"{name:18}" + "".join(f"{figures[c]:11.3f}" for c in columns) for name, figures in methods.items()]
+    columns = {
+        "mae": "MAE [m]",
+        "iou": "IoU",
+        "precision": "precision",
+        "recall": "recall",
+        "f1": "F1",
+        "floating": "floating",
+        "edge_mae": "at edges",
+    }
+    width = max(18, *map(len, methods))
+    lines = [f"{'method':{width}}" + "".join(f"{title:>11}" for title in columns.values())]
+    lines += [f"{name:{width}}" + "".join(f"{figures[c]:11.3f}" for c in columns) for name, figures in methods.items()]
     return "\n".join(lines)
 
 

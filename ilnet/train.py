@@ -14,9 +14,7 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
-from torch import nn
 from torch.utils.data import DataLoader
-from torchmetrics import MeanMetric
 
 from ilnet import data, metrics, models, simulate, towns
 from ilnet.scan import Scan
@@ -102,7 +100,7 @@ class Training(lightning.LightningModule):
     ):
         super().__init__()
         self.model, self.held_out, self.rate, self.halve_after, self.run = model, held_out, rate, halve_after, run
-        self.figures = nn.ModuleDict({name: MeanMetric() for name in metrics.NAMES})
+        self.figures = metrics.ScanMetrics()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Lets `train` refuse to go on with a run of another kind."""
@@ -122,13 +120,13 @@ class Training(lightning.LightningModule):
     def validation_step(self, number: int, index: int) -> None:
         """Measures one held-out scan."""
         scan, truth = self.held_out[number]
-        for name, value in metrics.compare(self.model.ranges(scan, truth.sensor).float(), truth).items():
-            self.figures[name].update(value)  # type: ignore[operator]
+        self.figures.update(self.model.ranges(scan, truth.sensor).float(), truth)
 
     def on_validation_epoch_end(self) -> None:
         """Logs the means over all scans of all processes."""
-        for name, figure in self.figures.items():
-            self.log(f"val/{name}", figure, prog_bar=name in ("mae", "iou"))  # type: ignore[arg-type]
+        for name, value in self.figures.compute().items():
+            self.log(f"val/{name}", value.float(), prog_bar=name in ("mae", "iou"))
+        self.figures.reset()
 
     def configure_optimizers(self) -> Any:
         """Adam; the rate warms up and decays to 0, or is halved now and then."""

@@ -28,7 +28,7 @@ def quick(monkeypatch, yard, quiet_street):
 
 def test_writes_weights_that_load_and_figures(tmp_path, quick):
     figures = quick(tmp_path)
-    assert set(figures) == {f"val/{name}" for name in ("mae", "iou", "precision", "recall", "f1")}
+    assert set(figures) == {f"val/{name}" for name in metrics.FIGURES}
     model = models.load(tmp_path / "iln-prior.safetensors")
     assert model.prior == models.create("iln-prior").prior
     with open(tmp_path / "iln-prior" / "from-step-0" / "metrics.csv") as log:
@@ -170,7 +170,7 @@ def test_stored_images_are_learned_from(tmp_path, quick, monkeypatch):
     archive.write(0, flat, np.zeros(2, int), np.zeros(2, int), np.zeros((2, 4, 4)))
     monkeypatch.setitem(train.PRESETS, "tiny", dataclasses.replace(train.PRESETS["tiny"], crops=2, columns=1024))
     figures = quick(tmp_path / "out", archive=tmp_path / "data")
-    assert set(figures) == {f"val/{name}" for name in metrics.NAMES}
+    assert set(figures) == {f"val/{name}" for name in metrics.FIGURES}
     with pytest.raises(ValueError, match=r"preset paper learns from stored images.*--data DIR"):
         train.train("iln", "paper", tmp_path)
     with pytest.raises(FileNotFoundError, match="no such folder"):
