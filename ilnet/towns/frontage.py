@@ -211,7 +211,8 @@ def _terrace(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
     half, front = (size.width + 0.7 * size.space) / 2, -size.setback + 0.3
     low, high = site.ground.height(lot.world([[0, front], [0, size.depth + 2]]))
     lift = min(high - low, 2.8)
-    if lift < 0.5:
+    plot = site.footprint(lot.moved(0, front).origin, lot.yaw, 2 * half, size.depth + 2.5 - front)
+    if lift < 0.5 or site.ground.edge(plot).min() < 1.0:
         _villa(site, lot, size, greens, rng)
         return
     count = int(np.ceil(lift / 0.18))
@@ -228,10 +229,9 @@ def _terrace(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
     for _ in range(int(rng.integers(1, 5))):
         bush = greens["bush"][int(rng.integers(0, len(greens["bush"])))]
         parts.append(shift(bush, rng.uniform(-half + 1, half - 1), rng.uniform(front + 0.9, -1.0), lift))
-    foot = lot.moved(0, front)
     at = np.append(lot.origin, low)  # the wall stands on the street's level, and not on that of the house
     site.put_at(merge(parts), at, lot.yaw)
-    site.claim(site.footprint(foot.origin, lot.yaw, 2 * half, size.depth + 2.5 - front))
+    site.claim(plot)
 
 
 def _factory(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:
@@ -240,7 +240,8 @@ def _factory(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
     site.put(buildings.hall(rng, size.width, size.depth, height), lot.origin, lot.yaw)
     half, front = size.width / 2 + 0.4 * size.space, -size.setback + 0.4
     gate = rng.uniform(-0.3, 0.3) * half
-    panel = (structures.mesh_fence(), 3.0) if rng.random() < 0.75 else (structures.stone_wall(rng, 1.6), 3.0)
+    concrete = boxes([0, -0.1, -0.4], [3.0, 0.1, 1.9])
+    panel = (structures.mesh_fence() if rng.random() < 0.8 else concrete, 3.0)
     if rng.random() < 0.8:
         site.run(*panel, lot.world([[-half, front], [gate - 4.5, front]]))
         site.run(*panel, lot.world([[gate + 4.5, front], [half, front]]))
@@ -288,6 +289,9 @@ def _farm(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Gene
         at = lot.moved(side * (size.width / 2 + 6 + width / 2 + 3 * k), rng.uniform(-2, 4) + k * 15)
         if _try(site, at, width, depth, 4.0):
             site.put(buildings.barn(rng, width, depth), at.origin, at.yaw)
+            yard = at.world([rng.uniform(-0.3, 0.3) * width, -3.5])
+            if site.free(yard, 3.0):
+                site.park(yard, at.yaw + rng.uniform(-0.4, 0.4))
             if rng.random() < 0.5:
                 spot = at.world([[side * (width / 2 + 3.2), 4.0]])
                 if site.free(spot, 3.0):

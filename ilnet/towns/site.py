@@ -50,7 +50,7 @@ class Site:
         """Repeat a panel that runs along +x from its origin along a path (N, 2), `kerb` metres off the carriageways."""
         path = np.asarray(path, dtype=np.float64)
         for start, end in pairwise(path):
-            length = np.linalg.norm(end - start)
+            length = np.hypot(*(end - start))
             if length < 0.5:
                 continue
             count = max(1, round(length / panel_length))

@@ -77,7 +77,12 @@ def traffic(
     parking, walks = (
         spots[_distance(spots, sensor) < radius].astype(np.float64) for spots in (town.parking, town.walks)
     )
-    drawn = [_driving(lane, slope, rng), _crossing(lane, rng), _parked(parking, lane, slope, rng), _walking(walks, rng)]
+    drawn = [
+        _driving(lane, slope, walks, rng),
+        _crossing(lane, walks, rng),
+        _parked(parking, lane, slope, rng),
+        _walking(walks, rng),
+    ]
     things = _Things(*(np.concatenate(column) for column in zip(*drawn, strict=True)))
     heading = lane[_distance(lane, sensor).argmin(), 3] if len(lane) else 0.0
     keep = _apart(things, sensor, heading)
@@ -108,25 +113,31 @@ def _aside(spot: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.column_stack([spot[:, :2] + step, spot[:, 2:]])
 
 
-def _driving(lane: np.ndarray, slope: np.ndarray, rng: np.random.Generator) -> _Things:
-    """On the lanes, from an empty road to a slow column; cyclists keep to the right."""
+def _driving(lane: np.ndarray, slope: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> _Things:
+    """On the lanes, from an empty road to a slow column; cyclists keep to the right, and off the highways."""
     spacing = np.exp(rng.uniform(np.log(16), np.log(110)))
     pick = rng.permutation(np.nonzero(rng.random(len(lane)) < 1.8 / spacing)[0])
     lorries, cyclists = rng.uniform(0.03, 0.2), rng.uniform(0.0, 0.12)
     cars = 0.87 - lorries - cyclists
     share = [0.4 * cars, 0.35 * cars, 0.25 * cars, 0.13, lorries, cyclists]
     kind = rng.choice([*_CARS, _VAN, _LORRY, _CYCLIST], len(pick), p=share)
+    kind = np.where((kind == _CYCLIST) & ~_beside(lane[pick], walks), _CARS[0], kind)
     right = np.where(kind == _CYCLIST, 0.75, rng.uniform(-0.15, 0.15, len(pick)))
     return _things(_aside(lane[pick], right), slope[pick], kind, drives=True)
 
 
-def _crossing(lane: np.ndarray, rng: np.random.Generator) -> _Things:
-    """A few people on the carriageway, square to a lane."""
-    count = min(int(rng.integers(0, 5)), len(lane))
-    spot = lane[rng.integers(0, max(len(lane), 1), count)].reshape(-1, 4)
-    spot = _aside(spot, rng.uniform(-1.5, 1.5, count))
-    spot[:, 3] += np.pi / 2 * rng.choice([-1, 1], count)
-    return _things(spot, 0.0, rng.choice(_PEOPLE, count), drives=False)
+def _crossing(lane: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> _Things:
+    """A few people on the carriageway, square to a lane, where there are pavements."""
+    spot = lane[rng.random(len(lane)) < rng.uniform(0, 5) / max(len(lane), 1)]
+    spot = spot[_beside(spot, walks)]
+    spot = _aside(spot, rng.uniform(-1.5, 1.5, len(spot)))
+    spot[:, 3] += np.pi / 2 * rng.choice([-1, 1], len(spot))
+    return _things(spot, 0.0, rng.choice(_PEOPLE, len(spot)), drives=False)
+
+
+def _beside(lane: np.ndarray, walks: np.ndarray) -> np.ndarray:
+    """Whether people walk within 12 m of points (N, 4) on lanes."""
+    return (np.hypot(*(lane[:, None, k] - walks[None, :, k] for k in (0, 1))) < 12).any(1)
 
 
 def _parked(parking: np.ndarray, lane: np.ndarray, slope: np.ndarray, rng: np.random.Generator) -> _Things:
