@@ -19,11 +19,11 @@ def greenery(rng: np.random.Generator) -> Greens:
     """Prototypes of plants: of the street ("tall"), of gardens ("small"), of the distance ("far"), and others."""
     return {
         "tall": [
-            plants.tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 750, (0.18, 0.38), twigs=3)
+            plants.tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 1000, (0.14, 0.33), twigs=4)
             for _ in range(5)
         ],
         "small": [
-            plants.tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 440, (0.16, 0.33)) for _ in range(4)
+            plants.tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 560, (0.13, 0.29)) for _ in range(4)
         ],
         "bare": [plants.tree(rng, rng.uniform(7, 10), rng.uniform(2.2, 3.0), 3.3, 0, (0, 0)) for _ in range(2)],
         "conifer": [plants.conifer(rng, rng.uniform(6, 11), 420) for _ in range(2)],

@@ -69,6 +69,9 @@ def _garden(
     side = _boundary(rng)
     if side:
         site.run(*side, lot.world([[-half, front], [-half, depth + 8]]))
+        back = lot.world([[-half, depth + 8], [half, depth + 8]])
+        if not site.taken(back).any():
+            site.run(*side, back)
     if drive and setback > 4:
         y = -setback / 2 + rng.uniform(-0.2, 1.5)
         if site.free(lot.world([[half - 1.6, y - 2.2], [half - 1.6, y], [half - 1.6, y + 2.2]]), 0.9):
@@ -212,7 +215,7 @@ def _terrace(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
     low, high = site.ground.height(lot.world([[0, front], [0, size.depth + 2]]))
     lift = min(high - low, 2.8)
     plot = site.footprint(lot.moved(0, front).origin, lot.yaw, 2 * half, size.depth + 2.5 - front)
-    if lift < 0.5 or site.ground.edge(plot).min() < 1.0:
+    if lift < 0.4 or site.ground.edge(plot).min() < 1.0:
         _villa(site, lot, size, greens, rng)
         return
     count = int(np.ceil(lift / 0.18))
@@ -254,6 +257,8 @@ def _factory(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
     site.walk(lot.world(np.column_stack([spots[::3], np.full(len(spots[::3]), front + 8.0)])), lot.yaw)
     for x in np.arange(-half + 4, half - 2, 7.0):
         kind = rng.random()
+        if site.ground.edge(lot.world([[x, -1.0], [x, -14.0]])).min() < 2.0:
+            continue
         spot = lot.world([x, -7.2 + rng.uniform(-0.6, 0.3)])
         if kind < 0.22 and size.setback > 15:
             site.put(structures.trailer(), spot, lot.yaw - np.pi / 2)
@@ -266,13 +271,16 @@ def _factory(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
             site.put(stack, lot.world(np.column_stack([x + 1.4 * np.arange(3), np.full(3, -1.5)])), lot.yaw)
     edge = size.width / 2 + 0.2 * size.space
     kind = rng.random()
-    if kind < 0.3 and size.space > 14:
+    if site.ground.edge(lot.world([[edge + 8.0, 6.0], [edge, 0.0]])).min() < 4.0:
+        pass  # a street runs there
+    elif kind < 0.3 and size.space > 14:
         site.put(structures.tank(2.6, rng.uniform(5, 9)), lot.world([edge + 2.0, 6.0]), lot.yaw)
     elif kind < 0.5 and size.space > 12:
         site.put(structures.silo(1.7, rng.uniform(8, 13)), lot.world([[edge, 4.0], [edge, 8.2]]), lot.yaw)
     elif kind < 0.7:  # an office in front of the hall
         office = lot.moved(rng.choice([-1, 1]) * (size.width / 2 - 5.5), -5.0)
-        if np.abs(office.origin - lot.world([gate, -5.0])).max() > 7:
+        foot = site.footprint(office.origin, office.yaw, 10.0, 5.0)
+        if np.hypot(*(office.origin - lot.world([gate, -5.0])[0])) > 7 and site.ground.edge(foot).min() > 1.0:
             site.put(
                 buildings.block(rng, 10.0, 5.0, int(rng.integers(2, 4)), "flats", "flat"), office.origin, office.yaw
             )

@@ -148,8 +148,9 @@ def _render(
     with pyvista.vtk_verbosity("off"):
         plotter = pyvista.Plotter(off_screen=True, window_size=[2 * s for s in size], lighting="none")
         plotter.renderer.set_background(_COLOURS["sky"])
-        for position, strength in (((-300, -500, 600), 0.5), ((500, 200, 300), 0.25), ((0, 0, 900), 0.15)):
+        for position, strength in (((-300, -500, 500), 0.5), ((500, 250, 250), 0.2), ((0, 0, 900), 0.1)):
             plotter.add_light(pyvista.Light(position=position, focal_point=(0, 0, 0), intensity=strength))
+        plotter.add_light(pyvista.Light(light_type="headlight", intensity=0.22))
         for surface in surfaces:
             plotter.add_mesh(surface, scalars="paint", rgb=True, ambient=0.55, diffuse=0.75)
         plotter.camera_position = camera

@@ -13,7 +13,7 @@ from ilnet.towns.town import Town
 
 __all__ = ["traffic"]
 
-_CARS, _VAN, _LORRY, _CYCLIST, _BICYCLE, _PEOPLE = (0, 1, 2), 3, 4, 5, 6, (7, 8, 9)
+_CARS, _VAN, _LORRY, _BUS, _CYCLIST, _BICYCLE, _PEOPLE = (0, 1, 2), 3, 4, 5, 6, 7, (8, 9, 10)
 # Metres kept free ahead of and behind the sensor, whose own car is not drawn, and to its sides.
 _OWN_CAR = (4.5, 1.3)
 _STRETCH = 1.05  # vehicles differ in length, width and height by up to 5 %
@@ -44,8 +44,9 @@ class _Things(NamedTuple):
 def _fleet() -> tuple[_Kind, ...]:
     """Returns the prototypes, by the numbers above."""
     walkers = [vehicles.pedestrian(*pose) for pose in ((0.7, 0.25), (0.5, 0.15), (0.1, 0.05))]
-    gaps = {_LORRY: 3.5, _CYCLIST: 0.8} | dict.fromkeys((*_CARS, _VAN), 1.0)
-    parts = [*map(vehicles.car, range(3)), vehicles.van(), vehicles.lorry(), vehicles.cyclist(), vehicles.bicycle()]
+    gaps = {_LORRY: 3.5, _BUS: 3.5, _CYCLIST: 0.8} | dict.fromkeys((*_CARS, _VAN), 1.0)
+    heavy = [vehicles.van(), vehicles.lorry(), vehicles.bus()]
+    parts = [*map(vehicles.car, range(3)), *heavy, vehicles.cyclist(), vehicles.bicycle()]
     kinds = []
     for number, part in enumerate(parts + walkers):
         reach = np.abs(part.vertices[:, :2]).max(0) * _STRETCH
@@ -119,8 +120,8 @@ def _driving(lane: np.ndarray, slope: np.ndarray, walks: np.ndarray, rng: np.ran
     pick = rng.permutation(np.nonzero(rng.random(len(lane)) < 1.8 / spacing)[0])
     lorries, cyclists = rng.uniform(0.03, 0.2), rng.uniform(0.0, 0.12)
     cars = 0.87 - lorries - cyclists
-    share = [0.4 * cars, 0.35 * cars, 0.25 * cars, 0.13, lorries, cyclists]
-    kind = rng.choice([*_CARS, _VAN, _LORRY, _CYCLIST], len(pick), p=share)
+    share = [0.4 * cars, 0.35 * cars, 0.25 * cars, 0.13, 0.8 * lorries, 0.2 * lorries, cyclists]
+    kind = rng.choice([*_CARS, _VAN, _LORRY, _BUS, _CYCLIST], len(pick), p=share)
     kind = np.where((kind == _CYCLIST) & ~_beside(lane[pick], walks), _CARS[0], kind)
     right = np.where(kind == _CYCLIST, 0.75, rng.uniform(-0.15, 0.15, len(pick)))
     return _things(_aside(lane[pick], right), slope[pick], kind, drives=True)
