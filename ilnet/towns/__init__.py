@@ -15,8 +15,8 @@ _TOWNS = {
     "town04": (town04.PLAN, 4930),
     "town05": (town05.PLAN, 5224),
     "town06": (town06.PLAN, 2970),
-    "town07": (town07.PLAN, 1400),
-    "town10": (town10.PLAN, 1447),
+    "town07": (town07.PLAN, 1385),
+    "town10": (town10.PLAN, 1462),
 }
 NAMES = tuple(_TOWNS)
 TRAIN, TEST = NAMES[:6], NAMES[6:]

@@ -319,6 +319,10 @@ def block(rng: np.random.Generator, width: float, depth: float, floors: int, gro
         low = np.column_stack([x - 0.28, 0 * x + 0.02, 0 * x - _FOOTING])
         parts += [ceiling, boxes(low, np.column_stack([x + 0.28, 0 * x + 0.55, 0 * x + first]))]
         parts.append(boxes([-h, 0, first - 0.45], [h, 0.5, first]))
+    if ground_floor != "flats" and rng.random() < 0.6:  # a sign on a bracket
+        plate = boxes([-0.04, -0.95, -0.3], [0.04, -0.25, 0.6])
+        bracket = tubes([0, 0, 0.5], [0, -0.3, 0.5], 0.02, sides=3, caps=False)
+        parts.append(shift(merge([plate, bracket]), rng.uniform(-0.4, 0.4) * width, 0.0, first))
     if ground_floor == "shops" and rng.random() < 0.7:  # a shop sign and awnings
         parts.append(boxes([-width / 2 + 0.3, -0.18, first - 0.75], [width / 2 - 0.3, 0, first - 0.2]))
         for x in np.arange(-width / 2 + 1.0, width / 2 - 3.4, 4.4)[: int(rng.integers(0, 4))]:
@@ -327,7 +331,7 @@ def block(rng: np.random.Generator, width: float, depth: float, floors: int, gro
             parts.append(
                 quads([[[x, -1.1, z - 0.45], [x + 3, -1.1, z - 0.45], [x + 3, -1.1, z - 0.65], [x, -1.1, z - 0.65]]])
             )
-    if ground_floor in ("flats", "passage") and len(row) > 2 and rng.random() < 0.7:
+    if len(row) > 2 and rng.random() < (0.7 if ground_floor in ("flats", "passage") else 0.35):
         proto = _balcony(min(pitch - 0.3, 3.4), rng.uniform(1.0, 1.5), solid=rng.random() < 0.5)
         x = row[:, :2].mean(1) - width / 2
         pick = np.arange(len(x)) % int(rng.integers(3, 5)) == 1

@@ -19,11 +19,11 @@ def greenery(rng: np.random.Generator) -> Greens:
     """Prototypes of plants: of the street ("tall"), of gardens ("small"), of the distance ("far"), and others."""
     return {
         "tall": [
-            plants.tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 750, (0.18, 0.38), twigs=3)
+            plants.tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 1000, (0.14, 0.33), twigs=4)
             for _ in range(5)
         ],
         "small": [
-            plants.tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 440, (0.16, 0.33)) for _ in range(4)
+            plants.tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 560, (0.13, 0.29)) for _ in range(4)
         ],
         "bare": [plants.tree(rng, rng.uniform(7, 10), rng.uniform(2.2, 3.0), 3.3, 0, (0, 0)) for _ in range(2)],
         "conifer": [plants.conifer(rng, rng.uniform(6, 11), 420) for _ in range(2)],
@@ -79,7 +79,7 @@ def dress_street(site: Site, street: Street, greens: Greens, rng: np.random.Gene
         wide = side * (street.half + street.pavement - 0.5)
         if not country:
             stand([furniture.bin_(False), furniture.bin_(True)], 20, 35, 0.6, wide, inward)
-            _walks(site, street, side, rng)
+        _walks(site, street, side, 24.0 if country else 4.0, rng)
         if busy:
             stand([furniture.bench()], 16, 41, 0.7, wide, inward)
             stand([furniture.bollard()], 3, 2.2, 0.25, offset, 0.0)
@@ -122,7 +122,7 @@ def _dress_highway(site: Site, street: Street, greens: Greens, rng: np.random.Ge
         site.put(furniture.sign(2, 2.9), xy[clear], heading[clear] + (np.pi if side > 0 else 0.0), 1.5)
         xy, _ = street.at(np.arange(5, street.length - 5, 3.0), side * (street.half + rng.uniform(4, 9)))
         for at in xy[(ground.edge(xy) > 2.5) & ~site.taken(xy) & (rng.random(len(xy)) < 0.4)]:
-            kind = str(rng.choice(["bush", "small", "far"], p=[0.6, 0.25, 0.15]))
+            kind = str(rng.choice(["bush", "small", "tall"], p=[0.6, 0.2, 0.2]))
             site.put(_pick(greens[kind], rng), at + rng.uniform(-1.5, 1.5, 2), rng.uniform(0, 6), rng.uniform(0.8, 1.5))
     if street.median:
         xy, heading = line(0.0)
@@ -160,7 +160,7 @@ def _verge(site: Site, street: Street, side: int, greens: Greens, rng: np.random
         if kind in ("trees", "bank"):
             spots = xy[:: 2 if kind == "trees" else 3]
             for at in spots[(site.ground.edge(spots) > 1.5) & ~site.taken(spots)]:
-                site.put(_pick(greens["tall"] + greens["far"], rng), at, rng.uniform(0, 6), rng.uniform(0.8, 1.1))
+                site.put(_pick(greens["tall"] + greens["bare"], rng), at, rng.uniform(0, 6), rng.uniform(0.8, 1.1))
         s += length + rng.uniform(4, 9)
 
 
@@ -177,12 +177,13 @@ def _parking(site: Site, street: Street, side: int, rng: np.random.Generator) ->
     site.park(xy[straight], (heading + turn)[straight])
 
 
-def _walks(site: Site, street: Street, side: int, rng: np.random.Generator) -> None:
-    """Places for people on one pavement, where nothing stands in their way."""
-    s = np.arange(3, street.length - 3, 4.0) + rng.uniform(-1.5, 1.5, len(np.arange(3, street.length - 3, 4.0)))
+def _walks(site: Site, street: Street, side: int, step: float, rng: np.random.Generator) -> None:
+    """Places for people on one pavement or verge, where nothing stands in their way."""
+    s = np.arange(3, street.length - 3, step)
+    s = s + rng.uniform(-0.4, 0.4, len(s)) * step
     xy, heading = street.at(s, side * (street.half + rng.uniform(0.95, max(street.pavement - 0.75, 1.0), len(s))))
     edge = site.ground.edge(xy)
-    clear = (edge > 0.5) & (edge < street.pavement) & ~site.taken(xy)
+    clear = (edge > 0.5) & (edge < max(street.pavement, 1.7)) & ~site.taken(xy)
     site.walk(xy[clear], (heading + np.pi * rng.integers(0, 2, len(s)))[clear])
 
 

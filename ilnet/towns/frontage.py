@@ -69,6 +69,9 @@ def _garden(
     side = _boundary(rng)
     if side:
         site.run(*side, lot.world([[-half, front], [-half, depth + 8]]))
+        back = lot.world([[-half, depth + 8], [half, depth + 8]])
+        if not site.taken(back).any():
+            site.run(*side, back)
     if drive and setback > 4:
         y = -setback / 2 + rng.uniform(-0.2, 1.5)
         if site.free(lot.world([[half - 1.6, y - 2.2], [half - 1.6, y], [half - 1.6, y + 2.2]]), 0.9):
@@ -211,7 +214,8 @@ def _terrace(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
     half, front = (size.width + 0.7 * size.space) / 2, -size.setback + 0.3
     low, high = site.ground.height(lot.world([[0, front], [0, size.depth + 2]]))
     lift = min(high - low, 2.8)
-    if lift < 0.5:
+    plot = site.footprint(lot.moved(0, front).origin, lot.yaw, 2 * half, size.depth + 2.5 - front)
+    if lift < 0.4 or site.ground.edge(plot).min() < 1.0:
         _villa(site, lot, size, greens, rng)
         return
     count = int(np.ceil(lift / 0.18))
@@ -228,10 +232,9 @@ def _terrace(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
     for _ in range(int(rng.integers(1, 5))):
         bush = greens["bush"][int(rng.integers(0, len(greens["bush"])))]
         parts.append(shift(bush, rng.uniform(-half + 1, half - 1), rng.uniform(front + 0.9, -1.0), lift))
-    foot = lot.moved(0, front)
     at = np.append(lot.origin, low)  # the wall stands on the street's level, and not on that of the house
     site.put_at(merge(parts), at, lot.yaw)
-    site.claim(site.footprint(foot.origin, lot.yaw, 2 * half, size.depth + 2.5 - front))
+    site.claim(plot)
 
 
 def _factory(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:
@@ -240,7 +243,8 @@ def _factory(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
     site.put(buildings.hall(rng, size.width, size.depth, height), lot.origin, lot.yaw)
     half, front = size.width / 2 + 0.4 * size.space, -size.setback + 0.4
     gate = rng.uniform(-0.3, 0.3) * half
-    panel = (structures.mesh_fence(), 3.0) if rng.random() < 0.75 else (structures.stone_wall(rng, 1.6), 3.0)
+    concrete = boxes([0, -0.1, -0.4], [3.0, 0.1, 1.9])
+    panel = (structures.mesh_fence() if rng.random() < 0.8 else concrete, 3.0)
     if rng.random() < 0.8:
         site.run(*panel, lot.world([[-half, front], [gate - 4.5, front]]))
         site.run(*panel, lot.world([[gate + 4.5, front], [half, front]]))
@@ -253,6 +257,8 @@ def _factory(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
     site.walk(lot.world(np.column_stack([spots[::3], np.full(len(spots[::3]), front + 8.0)])), lot.yaw)
     for x in np.arange(-half + 4, half - 2, 7.0):
         kind = rng.random()
+        if site.ground.edge(lot.world([[x, -1.0], [x, -14.0]])).min() < 2.0:
+            continue
         spot = lot.world([x, -7.2 + rng.uniform(-0.6, 0.3)])
         if kind < 0.22 and size.setback > 15:
             site.put(structures.trailer(), spot, lot.yaw - np.pi / 2)
@@ -265,13 +271,16 @@ def _factory(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
             site.put(stack, lot.world(np.column_stack([x + 1.4 * np.arange(3), np.full(3, -1.5)])), lot.yaw)
     edge = size.width / 2 + 0.2 * size.space
     kind = rng.random()
-    if kind < 0.3 and size.space > 14:
+    if site.ground.edge(lot.world([[edge + 8.0, 6.0], [edge, 0.0]])).min() < 4.0:
+        pass  # a street runs there
+    elif kind < 0.3 and size.space > 14:
         site.put(structures.tank(2.6, rng.uniform(5, 9)), lot.world([edge + 2.0, 6.0]), lot.yaw)
     elif kind < 0.5 and size.space > 12:
         site.put(structures.silo(1.7, rng.uniform(8, 13)), lot.world([[edge, 4.0], [edge, 8.2]]), lot.yaw)
     elif kind < 0.7:  # an office in front of the hall
         office = lot.moved(rng.choice([-1, 1]) * (size.width / 2 - 5.5), -5.0)
-        if np.abs(office.origin - lot.world([gate, -5.0])).max() > 7:
+        foot = site.footprint(office.origin, office.yaw, 10.0, 5.0)
+        if np.hypot(*(office.origin - lot.world([gate, -5.0])[0])) > 7 and site.ground.edge(foot).min() > 1.0:
             site.put(
                 buildings.block(rng, 10.0, 5.0, int(rng.integers(2, 4)), "flats", "flat"), office.origin, office.yaw
             )
@@ -288,6 +297,9 @@ def _farm(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Gene
         at = lot.moved(side * (size.width / 2 + 6 + width / 2 + 3 * k), rng.uniform(-2, 4) + k * 15)
         if _try(site, at, width, depth, 4.0):
             site.put(buildings.barn(rng, width, depth), at.origin, at.yaw)
+            yard = at.world([rng.uniform(-0.3, 0.3) * width, -3.5])
+            if site.free(yard, 3.0):
+                site.park(yard, at.yaw + rng.uniform(-0.4, 0.4))
             if rng.random() < 0.5:
                 spot = at.world([[side * (width / 2 + 3.2), 4.0]])
                 if site.free(spot, 3.0):

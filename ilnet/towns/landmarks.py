@@ -230,7 +230,8 @@ def tank_farm(site: Site, street: Street, share: float, side: int, rng: np.rando
     for x in (-18, 0, 18):
         for y in (12, 30):
             tank = structures.tank(rng.uniform(5.0, 7.0), rng.uniform(6.0, 11.0))
-            site.put(tank, lot.world([x, y]), lot.yaw + rng.uniform(-0.3, 0.3))
+            if site.ground.edge(lot.world([x, y]))[0] > 9:
+                site.put(tank, lot.world([x, y]), lot.yaw + rng.uniform(-0.3, 0.3))
     pipes = boxes([[-26, 3.2 + 0.5 * k, 0.6] for k in range(3)], [[26, 3.5 + 0.5 * k, 0.85] for k in range(3)])
     site.put(pipes, lot.origin, lot.yaw)
 
@@ -242,7 +243,7 @@ def container_yard(site: Site, street: Street, share: float, side: int, rng: np.
     short, long = structures.container(), structures.container(12.19)
     for row, y in enumerate((7.0, 9.8, 20.0, 22.8, 33.0)):
         for x in np.arange(-23.0, 24.0, 6.6 if row % 2 else 12.9):
-            if abs(x) < 5 and row < 2:
+            if (abs(x) < 5 and row < 2) or site.ground.edge(lot.world([x, y]))[0] < 8:
                 continue
             high = int(rng.choice([0, 1, 2, 3], p=[0.2, 0.35, 0.3, 0.15]))
             one = short if row % 2 else long

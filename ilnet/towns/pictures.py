@@ -93,11 +93,11 @@ def _surface(vertices: np.ndarray, triangles: np.ndarray, paint: np.ndarray):
     return surface
 
 
-def _near_lanes(town: Town, xy: np.ndarray, reach: int) -> np.ndarray:
-    """Whether points (N, 2) are within about `reach` metres of a waypoint."""
-    low = np.minimum(town.waypoints[:, :2].min(0), xy.min(0)) - reach - 2
-    cells = np.zeros(np.ceil(np.maximum(town.waypoints[:, :2].max(0), xy.max(0)) + reach + 2 - low).astype(int), bool)
-    i, j = np.round(town.waypoints[:, :2] - low).astype(int).T
+def _near(places: np.ndarray, xy: np.ndarray, reach: int) -> np.ndarray:
+    """Whether points (N, 2) are within about `reach` metres of any of the places (M, 2)."""
+    low = np.minimum(places.min(0), xy.min(0)) - reach - 2
+    cells = np.zeros(np.ceil(np.maximum(places.max(0), xy.max(0)) + reach + 2 - low).astype(int), dtype=bool)
+    i, j = np.round(places - low).astype(int).T
     for x in range(-reach, reach + 1):
         for y in range(-reach, reach + 1):
             if x * x + y * y <= reach * reach:
@@ -117,7 +117,8 @@ def _painted(town: Town):
     paint = np.full((len(triangles), 3), _COLOURS["wall"], dtype=np.uint8)
     paint[lone & (upright > 0.9)] = _COLOURS["ground"]
     middle = ((a + b + c) / 3)[:, :2]
-    paint[lone & (upright > 0.9) & (twice > 12) & ~_near_lanes(town, middle, 9)] = _COLOURS["lawn"]
+    paved = _near(town.waypoints[:, :2], middle, 9) | _near(town.walks[:, :2], middle, 4)
+    paint[lone & (upright > 0.9) & (twice > 12) & ~paved] = _COLOURS["lawn"]
     paint[lone & (twice < 0.8) & (upright < 0.99)] = _COLOURS["leaf"]
     paint[~lone & (twice > 8) & (upright > 0.3) & (upright < 0.97)] = _COLOURS["roof"]
     return _surface(vertices, triangles, paint)
@@ -147,8 +148,9 @@ def _render(
     with pyvista.vtk_verbosity("off"):
         plotter = pyvista.Plotter(off_screen=True, window_size=[2 * s for s in size], lighting="none")
         plotter.renderer.set_background(_COLOURS["sky"])
-        for position, strength in (((-300, -500, 600), 0.5), ((500, 200, 300), 0.25), ((0, 0, 900), 0.15)):
+        for position, strength in (((-300, -500, 500), 0.5), ((500, 250, 250), 0.2), ((0, 0, 900), 0.1)):
             plotter.add_light(pyvista.Light(position=position, focal_point=(0, 0, 0), intensity=strength))
+        plotter.add_light(pyvista.Light(light_type="headlight", intensity=0.22))
         for surface in surfaces:
             plotter.add_mesh(surface, scalars="paint", rgb=True, ambient=0.55, diffuse=0.75)
         plotter.camera_position = camera

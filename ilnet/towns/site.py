@@ -50,7 +50,7 @@ class Site:
         """Repeat a panel that runs along +x from its origin along a path (N, 2), `kerb` metres off the carriageways."""
         path = np.asarray(path, dtype=np.float64)
         for start, end in pairwise(path):
-            length = np.linalg.norm(end - start)
+            length = np.hypot(*(end - start))
             if length < 0.5:
                 continue
             count = max(1, round(length / panel_length))
@@ -89,8 +89,20 @@ class Site:
         """Returns what has been built, with at most `count` waypoints."""
         vertices, triangles = self._mesh()
         waypoints, headings = lanes(self.ground)
+        room = self._room(waypoints, vertices)
+        waypoints, headings = waypoints[room], headings[room]
         parking, walks = (raster(np.concatenate([np.zeros((0, 4)), *spots])) for spots in (self._parking, self._walks))
         return Town(name, seed, vertices, triangles, waypoints[:count], headings[:count], parking, walks)
+
+    def _room(self, waypoints: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+        """Whether nothing hangs over the lane, a bough say, within 1.3 m of where a car carries its sensor; (N,)."""
+        vertices = vertices[np.abs(vertices[:, :2]).max(1) < self.ground.extent]
+        rise = vertices[:, 2] - self.ground.height(vertices[:, :2])
+        vertices = vertices[(rise > 0.4) & (rise < 3.2)]
+        vertices = vertices[self.ground.edge(vertices[:, :2]) < 0.2]
+        sensors = waypoints + np.array([0, 0, 1.8], dtype=np.float32)
+        nearest = [((vertices - at) ** 2).sum(1).min(initial=9.0) for at in sensors]
+        return np.array(nearest) > 1.3**2
 
     def _mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (V, 3) float32 on a 1/1024 m raster and triangles (F, 3) int32 without slivers."""

@@ -105,8 +105,8 @@ def post_and_rail() -> Part:
 def stone_wall(rng: np.random.Generator, height: float) -> Part:
     """A panel of 3 m of a dry wall with uneven coping."""
     x = np.arange(0.0, 3.0, 0.3)
-    top = height + rng.uniform(-0.08, 0.08, len(x))
-    out = rng.uniform(0.2, 0.28, len(x))
+    top = height + rng.uniform(-0.05, 0.05, len(x))
+    out = rng.uniform(0.22, 0.27, len(x))
     return boxes(np.column_stack([x, -out, np.full(len(x), -0.4)]), np.column_stack([x + 0.3, out, top]), ends=True)
 
 

@@ -55,4 +55,4 @@ def lanes(ground: Ground) -> tuple[np.ndarray, np.ndarray]:
                 points.append(np.column_stack([xy, ground.height(xy)])[clear])
                 headings.append((heading if way > 0 else heading + np.pi)[clear])
     turned = np.mod(np.concatenate(headings) + np.pi, 2 * np.pi) - np.pi
-    return raster(np.concatenate(points)), turned.astype(np.float32)
+    return raster(np.concatenate(points)), raster(turned)

@@ -61,4 +61,4 @@ def _landmarks(site: Site, streets: dict[str, Street], greens: Greens, rng: np.r
     park(site, streets["crescent"], 0.45, 1, 46.0, 34.0, greens, rng)
 
 
-PLAN = Plan(_streets, _landmarks, steepness=0.1)
+PLAN = Plan(_streets, _landmarks, steepness=0.125)

@@ -15,10 +15,10 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
     """On about 560 m x 440 m."""
     draft = Draft(rng)
     curve, on = draft.curve, draft.on
-    road = curve([(-290, -70), (-190, 15), (-70, -30), (40, 35), (160, -20), (290, 45)])
-    north = curve([on(road, 0.38), (-60, 60), (-110, 120), (-70, 190)], "s")
-    south = curve([on(road, 0.68), (110, -80), (60, -140), (80, -215)], "s")
-    track = curve([on(south, 0.5), (0, -110), (-60, -150), (-140, -130)], "s")
+    road = curve([(-265, -65), (-190, 15), (-70, -30), (40, 35), (160, -20), (265, 40)])
+    north = curve([on(road, 0.38), (-60, 60), (-110, 115), (-75, 165)], "s")
+    south = curve([on(road, 0.68), (110, -80), (60, -140), (75, -195)], "s")
+    track = curve([on(south, 0.5), (0, -110), (-55, -140), (-105, -125)], "s")
     half = rng.uniform(2.6, 2.9, 4)
 
     def lane(line: np.ndarray, number: int, frontage: str) -> Street:

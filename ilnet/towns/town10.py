@@ -16,10 +16,10 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
     draft = Draft(rng, 7.0)
     curve, on = draft.curve, draft.on
     square = draft.closed([(40, 0), (36, 24), (0, 30), (-38, 26), (-42, 0), (-36, -25), (0, -29), (38, -24)])
-    north = curve([on(square, 0.22), (-5, 75), (25, 115), (5, 185)], "s")
-    west = curve([on(square, 0.44), (-85, 45), (-130, 30), (-195, 70)], "s")
-    south = curve([on(square, 0.68), (-25, -80), (-60, -120), (-45, -190)], "s")
-    east = curve([on(square, 0.93), (85, -35), (135, -15), (200, -50)], "s")
+    north = curve([on(square, 0.22), (-5, 75), (25, 115), (5, 178)], "s")
+    west = curve([on(square, 0.44), (-85, 45), (-130, 30), (-185, 70)], "s")
+    south = curve([on(square, 0.68), (-25, -80), (-60, -120), (-45, -180)], "s")
+    east = curve([on(square, 0.93), (85, -35), (135, -15), (190, -50)], "s")
     lane = curve([on(west, 0.45), (-95, 85), (-55, 100), on(north, 0.5)], "se")
     alley = curve([on(south, 0.42), (15, -85), (60, -75), on(east, 0.4)], "se")
     boulevard = curve([on(east, 0.72), (150, 60), (95, 130), on(north, 0.8)], "se")
@@ -32,7 +32,7 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
             "east": Street(east, 4.9, (1.6,), "old", 2.2),
             "lane": Street(lane, 2.9, (1.4,), "old", 1.3, parking=False),
             "alley": Street(alley, 2.9, (1.4,), "old", 1.3, parking=False),
-            "boulevard": Street(boulevard, 7.6, (1.7, 5.0), "downtown", 3.4, parking=False),
+            "boulevard": Street(boulevard, 7.8, (3.6,), "downtown", 3.4, median=1.7),
         }
     )
 
