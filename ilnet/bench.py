@@ -327,7 +327,8 @@ def _draw_batches(model: models.ILN, optimizer: torch.optim.Optimizer, device: t
     street = data.street(demo.TOWN, 0, device)
     rays = data.ContinuousRays([street], preset(INPUT), size.crops, size.columns, size.queries, seed=0)
     batches = iter(rays)
-    image, queries, truth = (tensor.to(device) for tensor in next(batches))
+    batch = next(batches)
+    image, queries, truth = (tensor.to(device) for tensor in (batch.image, batch.queries, batch.ranges))
 
     nothing = [torch.zeros(1)]  # they have no result in common
 

@@ -10,6 +10,8 @@ import click
 
 __all__ = ["main"]
 
+_SIZES = "16x1024,64x1024,128x2048,256x4096"
+
 
 class _Size(click.ParamType):
     """Rows and columns of a range image."""
@@ -82,12 +84,16 @@ def demo(
 @click.option("--preset", default="tiny", show_default=True, help="Size of the network and of its training.")
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps, instead of the preset's.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of weights and rays.")
+@click.option("--data", type=Path, metavar="DIR", help="Learn from stored images: an archive or a tree of .rimg files.")
 @click.option("--out", type=Path, default=Path("runs"), show_default=True, help="Folder for weights, figures, logs.")
-def train(model: str, preset: str, steps: int | None, seed: int, out: Path) -> None:
-    """Train MODEL on rays cast at continuous directions; goes on where an interrupted run in --out stopped."""
+def train(model: str, preset: str, steps: int | None, seed: int, data: Path | None, out: Path) -> None:
+    """Train MODEL on rays cast at continuous directions; goes on where an interrupted run in --out stopped.
+
+    `torchrun --nproc-per-node N -m ilnet train MODEL` shares each batch among N processes or GPUs.
+    """
     from ilnet import train as training
 
-    figures = training.train(model, preset, out, steps, seed)
+    figures = training.train(model, preset, out, steps, seed, data)
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
 
 
@@ -189,6 +195,64 @@ def upsample_(
 
 
 @cli.command()
+@click.option("--towns", metavar="NAMES", help="Towns, comma separated, with a seed as in town01:7; all unless told.")
+@click.option("--mesh", type=Path, metavar="FILE", help="Scan this mesh (metres, z up) instead of towns.")
+@click.option("--at", type=Path, metavar="JSON", help='Sensor positions in the mesh [m]: {"positions": [[x, y, z]]}.')
+@click.option("--scans", type=click.IntRange(min=1), required=True, metavar="N", help="Poses to scan from, in all.")
+@click.option("--sizes", metavar="HxW", help=f"Of the paper's sensor, comma separated; {_SIZES} unless told.")
+@click.option("--sensor", metavar="NAMES", help="Presets, comma separated, instead of --sizes.")
+@click.option("--effect", "effects", multiple=True, metavar="NAME=VALUE", help="Such as range_noise=0.02.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of waypoints, poses, traffic.")
+@click.option("--shard", metavar="I/N", default="1/1", help="Do part I of N, for many hosts; merge by copying files.")
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes on a CPU; all cores unless told.")
+@click.option("--out", type=Path, required=True, help="Folder of the archive; an interrupted run goes on there.")
+def simulate(
+    towns: str | None,
+    mesh: Path | None,
+    at: Path | None,
+    scans: int,
+    sizes: str | None,
+    sensor: str | None,
+    effects: tuple[str, ...],
+    seed: int,
+    shard: str,
+    workers: int | None,
+    out: Path,
+) -> None:
+    """Simulate scans into a Zarr archive; killed at any moment, the same command goes on."""
+    if bool(mesh) != bool(at):
+        raise click.UsageError("--mesh FILE and --at JSON go together")
+    if mesh and towns:
+        raise click.UsageError("--mesh and --towns exclude each other")
+    if sizes and sensor:
+        raise click.UsageError("--sizes and --sensor exclude each other")
+    part, _, parts = shard.partition("/")
+    if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
+        raise click.UsageError(f"--shard is {shard!r}; it should be I/N with 1 <= I <= N, such as 2/3")
+    from ilnet import generate
+    from ilnet.sensor import preset
+    from ilnet.towns import NAMES
+
+    if mesh and at:
+        places = generate.mesh_place(mesh, at)
+    else:
+        places = generate.town_places(towns.split(",") if towns else NAMES)
+    if sensor:
+        sensors = [preset(name) for name in sensor.split(",")]
+    else:
+        sensors = generate.sensors_of_sizes((sizes or _SIZES).split(","))
+    try:
+        wanted = generate.effects_of(effects)
+        archive = generate.generate(out, places, scans, sensors, seed, (int(part), int(parts)), workers, wanted)
+    except KeyboardInterrupt:
+        click.echo(f"interrupted: what is complete stays in {out}; the same command goes on from there", err=True)
+        raise
+    left = len(archive.missing())
+    state = f"{left} units of {generate.UNIT} scans are left to other shards" if left else "complete"
+    click.echo(f"{out}: {scans} scans of {', '.join(archive.sizes)}: {state}")
+
+
+@cli.command()
 @click.argument("sections", nargs=-1, type=click.Choice(["ops", "frame", "train", "rays"]))
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON list instead of the table.")
 def bench(sections: tuple[str, ...], as_json: bool) -> None:
@@ -197,6 +261,53 @@ def bench(sections: tuple[str, ...], as_json: bool) -> None:
 
     rows = benchmarks.bench(sections)
     click.echo(json.dumps([row.json() for row in rows], indent=1) if as_json else benchmarks.table(rows))
+
+
+@cli.command()
+@click.option(
+    "--scan", "scans", type=Path, multiple=True, metavar="FILE", help="A measured scan that names its angles."
+)
+@click.option("--mesh", "meshes", type=Path, multiple=True, metavar="FILE", help="A mesh (metres, z up).")
+@click.option("--at", type=Path, multiple=True, metavar="JSON", help="Positions in the mesh: one file for each --mesh.")
+@click.option("--town", "towns", multiple=True, metavar="NAME", help="A town, or `all` of them.")
+@click.option("--out", type=Path, default=Path("survey_output"), show_default=True, help="Folder for the figure.")
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON list instead of the table.")
+def survey(
+    scans: tuple[Path, ...],
+    meshes: tuple[Path, ...],
+    at: tuple[Path, ...],
+    towns: tuple[str, ...],
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Compare towns and meshes with measured scans, all seen with the rays of each scan: a table and a figure."""
+    if len(meshes) != len(at):
+        raise click.UsageError("--mesh FILE and --at JSON go together, one each")
+    if not (scans or meshes or towns):
+        raise click.UsageError("give at least one --scan, --mesh or --town")
+    from ilnet import survey as comparison
+    from ilnet.towns import NAMES
+
+    entries = comparison.survey(scans, zip(meshes, at, strict=True), NAMES if towns == ("all",) else towns)
+    found = "[\n" + ",\n".join(map(json.dumps, comparison.records(entries))) + "\n]"
+    comparison.draw(entries, out / "survey.png")
+    (out / "survey.json").write_text(found + "\n")
+    click.echo(
+        found if as_json else f"{comparison.table(entries)}\n\nfigure and numbers: {out}/survey.png, survey.json"
+    )
+
+
+@cli.command()
+@click.option(
+    "--town", "names", multiple=True, metavar="NAME", help="Draw this town; may be repeated. All unless told."
+)
+@click.option("--out", type=Path, default=Path("towns_output"), show_default=True, help="Folder for the pictures.")
+def towns(names: tuple[str, ...], out: Path) -> None:
+    """Draw the procedural towns: from above, from the street, and one scan of each."""
+    from ilnet.towns import NAMES, pictures
+
+    for path in pictures.draw(list(names or NAMES), out):
+        click.echo(path)
 
 
 def _table(methods: dict[str, dict[str, Any]]) -> str:

@@ -1,4 +1,7 @@
-"""Training data: rays at continuous directions, cast while the network trains (paper, Sec. III-A: intractable)."""
+"""Training data: images stored on disk, and rays at continuous directions, cast while the network trains.
+
+The paper trains on the former and calls the latter intractable (Sec. III-A).
+"""
 
 import itertools
 import math
@@ -11,11 +14,23 @@ import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
 from ilnet import simulate, towns
+from ilnet.rimg import RangeImageTree
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, angles_to_directions
+from ilnet.store import Archive, open_archive
 from kernels import Mesh
 
-__all__ = ["Batch", "ContinuousRays", "Street", "held_out_scans", "street"]
+__all__ = [
+    "Archive",
+    "Batch",
+    "ContinuousRays",
+    "RangeImageTree",
+    "StoredImages",
+    "Street",
+    "held_out_scans",
+    "open_archive",
+    "street",
+]
 
 # Metres above the lane, and how it varies from car to car.
 SENSOR_HEIGHT = 1.8
@@ -35,6 +50,8 @@ class Batch(NamedTuple):
     """(B, Q, 2) pixel coordinates."""
     ranges: torch.Tensor
     """(B, Q) metres along the queries, no return filled with `norm_range`."""
+    wrap: bool
+    """Whether the images go full circle."""
 
 
 class Street(NamedTuple):
@@ -91,37 +108,44 @@ class ContinuousRays(IterableDataset):
         queries: Rays Q per crop.
         seed: Of the random numbers; seed and number of a batch decide what it holds.
         start: Number of the first batch, for a training that goes on.
+        part: (number, of how many) equal parts of each batch to cast, for training in several processes.
     """
 
     def __init__(
-        self, streets: list[Street], sensor: Sensor, crops: int, columns: int, queries: int, seed: int, start: int = 0
+        self,
+        streets: list[Street],
+        sensor: Sensor,
+        crops: int,
+        columns: int,
+        queries: int,
+        seed: int,
+        start: int = 0,
+        part: tuple[int, int] = (0, 1),
     ):
         self.streets, self.crops, self.queries, self.seed, self.start = streets, crops, queries, seed, start
         self.sensor = replace(sensor, azimuths=sensor.azimuths[:columns], name=f"{sensor.name} crop")
+        self.part = _part(crops, part)
 
     def __iter__(self) -> Iterator[Batch]:
-        worker = get_worker_info()
-        first, step = (worker.id, worker.num_workers) if worker else (0, 1)
-        return map(self._draw, itertools.count(self.start + first, step))
+        return map(self._draw, _numbers(self.start))
 
     def _draw(self, number: int) -> Batch:
-        state = np.random.SeedSequence((self.seed, number)).generate_state(1, np.uint64)
-        generator = torch.Generator().manual_seed(int(state[0] >> 1))
+        generator = _generator(self.seed, number)
 
         def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
             return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
 
         crops, sensor = self.crops, self.sensor
-        elevation = uniform(*sensor.elevations[[0, -1]], crops, self.queries)
-        azimuth = uniform(*sensor.azimuths[[_MARGIN, -1 - _MARGIN]], crops, self.queries)
-        grid = sensor.directions().double().view(1, -1, 3).expand(crops, -1, -1)
+        elevation = uniform(*sensor.elevations[[0, -1]], crops, self.queries)[self.part]
+        azimuth = uniform(*sensor.azimuths[[_MARGIN, -1 - _MARGIN]], crops, self.queries)[self.part]
+        grid = sensor.directions().double().view(1, -1, 3).expand(len(azimuth), -1, -1)
         rays = torch.cat((grid, angles_to_directions(elevation, azimuth)), 1)
         town = torch.randint(len(self.streets), (crops,), generator=generator)
         along = uniform(0, 1, crops)
         at = torch.stack([self._waypoint(*place) for place in zip(town.tolist(), along.tolist(), strict=True)])
         at[:, 2] += SENSOR_HEIGHT + uniform(-_HEIGHT_JITTER, _HEIGHT_JITTER, crops)
         turn, tilt = uniform(-math.pi, math.pi, crops), uniform(-_TILT_JITTER, _TILT_JITTER, 2, crops)
-        pose = simulate.pose(at, turn, *tilt)
+        town, pose = town[self.part], simulate.pose(at, turn, *tilt)[self.part]
         ranges = self._cast_traffic(town, pose, rays, number)
         for which in town.unique().tolist():
             chosen = town == which
@@ -129,7 +153,7 @@ class ContinuousRays(IterableDataset):
             ranges[chosen] = simulate.nearest([standing, ranges[chosen]])
         ranges = ranges.where(ranges >= max(sensor.min_range, 1e-9), sensor.norm_range).cpu()
         image, ranges = ranges.split([grid.shape[1], self.queries], 1)
-        return Batch(image.unflatten(1, sensor.shape), sensor.locate(elevation, azimuth), ranges.contiguous())
+        return Batch(image.unflatten(1, sensor.shape), sensor.locate(elevation, azimuth), ranges.contiguous(), False)
 
     def _waypoint(self, town: int, along: float) -> torch.Tensor:
         waypoints = self.streets[town].town.waypoints
@@ -140,8 +164,8 @@ class ContinuousRays(IterableDataset):
 
         They are one mesh, in which the crops stand so far apart that none sees another's.
         """
-        apart = torch.zeros(self.crops, 3, dtype=torch.float64)
-        apart[:, 0] = torch.arange(self.crops) * 4 * self.sensor.max_range
+        apart = torch.zeros(len(town), 3, dtype=torch.float64)
+        apart[:, 0] = torch.arange(len(town)) * 4 * self.sensor.max_range
         first, last = self.sensor.azimuths[[0, -1]]
         middle = angles_to_directions(torch.tensor(0.0), torch.tensor((first + last) / 2)).double()
         half = abs(last - first) / 2 + _TILT_JITTER
@@ -149,7 +173,7 @@ class ContinuousRays(IterableDataset):
         for crop, which in enumerate(town.tolist()):
             position, ahead = pose[crop, :3, 3].numpy(), pose[crop, :3, :3] @ middle
             sector = math.atan2(ahead[1], ahead[0]), half
-            seed = self.seed, number, crop
+            seed = self.seed, number, self.part.start + crop
             vertices, triangles = towns.traffic(self.streets[which].town, position, seed, sector=sector)
             moved = (vertices - position + apart[crop].numpy()).astype(np.float32)
             corners.append(torch.from_numpy(moved[triangles.ravel()]))
@@ -161,3 +185,76 @@ class ContinuousRays(IterableDataset):
         pose = pose.clone()
         pose[:, :3, 3] = apart
         return simulate.cast(mesh, pose, rays, self.sensor.max_range)
+
+
+class StoredImages(IterableDataset):
+    """Endless batches of stored scans and of pixels of denser images from the same places (paper, Sec. III-A).
+
+    Args:
+        archive: See `open_archive`.
+        source: Size of the input, such as "16x1024".
+        target: Size of the images that the pixels are taken from, such as "128x2048".
+        scans: Scans B in a batch; in the course of an epoch each scan of the archive is drawn once.
+        queries: Pixels Q per scan, all different.
+        seed: Of the random numbers; seed and number of a batch decide what it holds.
+        start: Number of the first batch, for a training that goes on.
+        part: (number, of how many) equal parts of each batch to read, for training in several processes.
+
+    Raises:
+        ValueError: If the archive lacks a size, or its images hold fewer pixels than `queries`.
+    """
+
+    def __init__(
+        self,
+        archive: Archive | RangeImageTree,
+        source: str,
+        target: str,
+        scans: int,
+        queries: int,
+        seed: int,
+        start: int = 0,
+        part: tuple[int, int] = (0, 1),
+    ):
+        for size in (source, target):
+            if size not in archive.sensors:
+                raise ValueError(f"{archive.path}: holds no scans of size {size}; it has {', '.join(archive.sizes)}")
+        sensor, dense = archive.sensors[source], archive.sensors[target]
+        if queries > (pixels := math.prod(dense.shape)):
+            raise ValueError(f"queries is {queries}; images of {target} have {pixels} pixels")
+        self.archive, self.source, self.target, self.scans, self.queries = archive, source, target, scans, queries
+        self.seed, self.start, self.part, self.wrap = seed, start, _part(scans, part), sensor.wrap
+        self.located = sensor.grid_queries(dense).view(-1, 2)
+
+    def __iter__(self) -> Iterator[Batch]:
+        return map(self._read, _numbers(self.start))
+
+    def _read(self, number: int) -> Batch:
+        images, queries, ranges = [], [], []
+        for place in range(number * self.scans, (number + 1) * self.scans)[self.part]:
+            epoch, place_in_epoch = divmod(place, len(self.archive))
+            order = torch.randperm(len(self.archive), generator=_generator(self.seed, 0, epoch))
+            scan = int(order[place_in_epoch])
+            pixels = torch.randperm(len(self.located), generator=_generator(self.seed, 1, place))[: self.queries]
+            images.append(self.archive.scan(scan, self.source).filled())
+            queries.append(self.located[pixels])
+            ranges.append(self.archive.scan(scan, self.target).filled().view(-1)[pixels])
+        return Batch(torch.stack(images), torch.stack(queries), torch.stack(ranges), self.wrap)
+
+
+def _part(batch: int, part: tuple[int, int]) -> slice:
+    number, parts = part
+    if batch % parts:
+        raise ValueError(f"a batch of {batch} cannot be shared out evenly among {parts} processes")
+    return slice(number * batch // parts, (number + 1) * batch // parts)
+
+
+def _numbers(start: int) -> Iterator[int]:
+    """Numbers of batches; the workers of a `DataLoader` take turns."""
+    worker = get_worker_info()
+    first, step = (worker.id, worker.num_workers) if worker else (0, 1)
+    return itertools.count(start + first, step)
+
+
+def _generator(*seed: int) -> torch.Generator:
+    state = np.random.SeedSequence(seed).generate_state(1, np.uint64)
+    return torch.Generator().manual_seed(int(state[0] >> 1))

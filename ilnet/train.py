@@ -1,5 +1,11 @@
-"""Training with Lightning: L1 on normalised ranges, rays at continuous directions (paper, Sec. III-B)."""
+"""Training with Lightning: L1 on normalised ranges (paper, Sec. III-B).
 
+What is learned from are rays cast at continuous directions while training goes on, or, as in the paper, the pixels of
+images stored on disk. Under `torchrun` several processes share each batch.
+"""
+
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -7,10 +13,10 @@ from typing import Any
 import lightning
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
-from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from torch.utils.data import DataLoader
 
-from ilnet import data, metrics, models, simulate
+from ilnet import data, metrics, models, simulate, towns
 from ilnet.scan import Scan
 from ilnet.sensor import preset
 
@@ -18,11 +24,12 @@ __all__ = ["PRESETS", "Preset", "Training", "train"]
 
 INPUT = "paper-16x1024"
 OUTPUT = "paper-64x1024"
-TOWN = "town01"
-# Towns that differ by their seed: streets to learn from, and one to choose by. Seed 0, the default, is left for tests.
-TRAIN_SEEDS = (1, 2, 3, 4)
-HELD_OUT_SEED = 5
-HELD_OUT_SCANS = 8
+# Of stored images: what is seen, and what pixels are taken from.
+INPUT_SIZE, TARGET_SIZE = "16x1024", "128x2048"
+# What the best weights are chosen by: scans of towns that no training sees. (Seed 0, the default, is that of training.)
+HELD_OUT = {"town01": 1, "town03": 1, "town05": 1}
+HELD_OUT_SCANS = 4
+PRECISION: Any = "bf16-mixed"
 # Steps.
 VALIDATE_EVERY = 200
 CHECKPOINT_EVERY = 100
@@ -32,12 +39,17 @@ CHECKPOINT_EVERY = 100
 class Preset:
     """The size of a network and of its training."""
 
-    blocks: int
+    steps: int = 0
+    """Optimiser steps; 0 where `epochs` tells them."""
+    epochs: int = 0
+    """How often each stored scan is seen; 0 where `steps` tells it."""
+    halve_after: tuple[int, ...] = ()
+    """Epochs after which the learning rate is halved. Where empty, it rises over the first steps and falls to 0 as a
+    cosine."""
+    rate: float = 1e-3
+    """Highest learning rate."""
+    blocks: int = 16
     """Residual blocks of the encoder."""
-    steps: int
-    """Optimiser steps."""
-    rate: float
-    """Highest learning rate; it rises over the first steps and falls to 0 as a cosine."""
     crops: int = 16
     """Crops in a step."""
     columns: int = 128
@@ -46,13 +58,25 @@ class Preset:
     """Rays per crop."""
     dropout: float = 0.0
     """In the attention blocks."""
+    towns: tuple[str, ...] = towns.TRAIN
+    """Where continuous rays are cast."""
 
     def arguments(self, name: str) -> dict[str, Any]:
         """What differs from the own defaults of the model called `name`."""
         return {"blocks": self.blocks} | ({} if name == "liif" else {"dropout": self.dropout})
 
 
-PRESETS = {"tiny": Preset(blocks=4, steps=150, rate=1e-3)}
+PRESETS = {
+    # As the authors' code does it, on stored images; days on a GPU.
+    "paper": Preset(
+        epochs=1000, halve_after=(200, 400, 600, 800), rate=1e-4, columns=1024, queries=16_384, dropout=0.1
+    ),
+    # Full-size networks: an hour and a half, and twenty minutes, on two cores.
+    "laptop": Preset(steps=5000),
+    "small": Preset(steps=1000),
+    # Minutes, for the course.
+    "tiny": Preset(steps=150, blocks=4, towns=("town01", "town02")),
+}
 
 
 class Training(lightning.LightningModule):
@@ -62,12 +86,21 @@ class Training(lightning.LightningModule):
         model: What is trained; it has a `norm_range`.
         held_out: Pairs of an input scan and the scan to be predicted.
         rate: Highest learning rate.
+        halve_after: Steps after which the rate is halved; where empty, it follows one cycle.
         run: What tells this run from others; kept in its checkpoints.
     """
 
-    def __init__(self, model: models.ILN | models.LIIF, held_out: list[list[Scan]], rate: float, run: dict[str, Any]):
+    def __init__(
+        self,
+        model: models.ILN | models.LIIF,
+        held_out: list[list[Scan]],
+        rate: float,
+        halve_after: Sequence[int] = (),
+        run: dict[str, Any] | None = None,
+    ):
         super().__init__()
-        self.model, self.held_out, self.rate, self.run = model, held_out, rate, run
+        self.model, self.held_out, self.rate, self.halve_after, self.run = model, held_out, rate, halve_after, run
+        self.figures = metrics.ScanMetrics()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Lets `train` refuse to go on with a run of another kind."""
@@ -75,89 +108,163 @@ class Training(lightning.LightningModule):
 
     def training_step(self, batch: data.Batch, index: int) -> torch.Tensor:
         """L1 between ranges scaled to [-1, 1]."""
-        predicted = self.model(batch.image, batch.queries, wrap=False)
+        predicted = self.model(batch.image, batch.queries, wrap=batch.wrap)
         loss = (predicted - batch.ranges).abs().mean() * (2 / self.model.norm_range)
+        if not loss.isfinite():
+            file = Path(self.trainer.default_root_dir) / f"step-{self.global_step}.pt"
+            torch.save({"batch": batch._asdict(), "model": self.model.state_dict()}, file)
+            raise ValueError(f"the loss of step {self.global_step} is {loss}; its batch and the weights are in {file}")
         self.log("loss", loss, prog_bar=True)
         return loss
 
     def validation_step(self, number: int, index: int) -> None:
         """Measures one held-out scan."""
         scan, truth = self.held_out[number]
-        for name, value in metrics.compare(self.model.ranges(scan, truth.sensor).float(), truth).items():
-            self.log(f"val/{name}", value, prog_bar=name in ("mae", "iou"), batch_size=1)
+        self.figures.update(self.model.ranges(scan, truth.sensor).float(), truth)
+
+    def on_validation_epoch_end(self) -> None:
+        """Logs the means over all scans of all processes."""
+        for name, value in self.figures.compute().items():
+            self.log(f"val/{name}", value.float(), prog_bar=name in ("mae", "iou"))
+        self.figures.reset()
 
     def configure_optimizers(self) -> Any:
-        """Adam; the rate warms up and decays to 0."""
+        """Adam; the rate warms up and decays to 0, or is halved now and then."""
         optimizer = torch.optim.Adam(self.parameters(), lr=self.rate)
         steps = int(self.trainer.estimated_stepping_batches)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, self.rate, steps, pct_start=min(0.3, 100 / steps))
+        schedule: torch.optim.lr_scheduler.LRScheduler
+        if self.halve_after:
+            schedule = torch.optim.lr_scheduler.MultiStepLR(optimizer, list(self.halve_after), 0.5)
+        else:
+            schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, self.rate, steps, pct_start=min(0.3, 100 / steps))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
 def train(
-    name: str, preset_name: str, out: Path, steps: int | None = None, seed: int = 0, **arguments: Any
+    name: str,
+    preset_name: str,
+    out: Path,
+    steps: int | None = None,
+    seed: int = 0,
+    archive: Path | None = None,
+    **arguments: Any,
 ) -> dict[str, float]:
     """Trains a model and writes its weights and figures; goes on where an interrupted run in `out` stopped.
+
+    Started by `torchrun`, all its processes share each batch, and the result is that of one process but for rounding.
 
     Args:
         name: One of `models.TRAINABLE`.
         preset_name: One of `PRESETS`.
-        out: Folder for `NAME.safetensors`, and below `NAME/` the checkpoint of an unfinished run and the figures of
-            each start, `from-step-N/metrics.csv`.
+        out: Folder for `NAME.safetensors`, and below `NAME/` the checkpoints of an unfinished run and the logs of each
+            start, `from-step-N/` with metrics.csv and what TensorBoard reads.
         steps: Overrides the preset's.
         seed: Of the initial weights and the rays, 0 or more.
+        archive: Stored images to learn from instead of continuous rays; see `data.open_archive`.
         **arguments: Override the model's.
 
     Returns:
-        The figures of the final weights on held-out scans.
+        The figures on held-out scans of the weights that were best there.
 
     Raises:
-        ValueError: If there is no such model or preset, or `out` holds an interrupted run of another kind.
+        ValueError: If there is no such model or preset, `out` holds an interrupted run of another kind, or the loss is
+            not a number.
     """
     if preset_name not in PRESETS:
         raise ValueError(f"unknown preset {preset_name!r}; known are {', '.join(PRESETS)}")
     if name not in models.TRAINABLE:
         raise ValueError(f"model {name!r} cannot be trained; these can: {', '.join(models.TRAINABLE)}")
     size = PRESETS[preset_name]
-    steps = size.steps if steps is None else steps
+    if size.epochs and archive is None:
+        raise ValueError(
+            f"preset {preset_name} learns from stored images: make some with `python -m ilnet simulate --sizes "
+            f"{INPUT_SIZE},{TARGET_SIZE} --out DIR`, and name them with --data DIR"
+        )
+    stored = None if archive is None else data.open_archive(archive)
+    per_epoch = -(-len(stored) // size.crops) if stored else 0
+    steps = steps or size.steps or size.epochs * per_epoch
     arguments = {**size.arguments(name), **arguments}
-    run = {"preset": preset_name, "steps": steps, "seed": seed, **arguments}
-    last = out / name / "last.ckpt"
-    start = _steps_done(last, run)
+    learns_from = str(archive) if archive else "continuous rays"
+    run = {"preset": preset_name, "steps": steps, "seed": seed, "data": learns_from, **arguments}
+    folder = out / name
+    start = _steps_done(folder / "last.ckpt", run)
 
     device = simulate.best_device()
+    number, processes = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     lightning.seed_everything(seed, verbose=False)
     model = models.create(name, **arguments)
     assert isinstance(model, models.ILN | models.LIIF)
-    streets = [data.street(TOWN, s, device) for s in TRAIN_SEEDS]
-    rays = data.ContinuousRays(streets, preset(INPUT), size.crops, size.columns, size.queries, seed, start)
-    held_out = data.held_out_scans(
-        data.street(TOWN, HELD_OUT_SEED, device), HELD_OUT_SCANS, [preset(INPUT), preset(OUTPUT)]
-    )
-    training = Training(model, held_out, size.rate, run)
-    scans: DataLoader[int] = DataLoader(range(len(held_out)), batch_size=None)  # type: ignore[arg-type]
+    samples = _samples(size, stored, seed, start, (number, processes), device)
+    held_out = [
+        pair
+        for town, held_out_seed in HELD_OUT.items()
+        for pair in data.held_out_scans(
+            data.street(town, held_out_seed, device), HELD_OUT_SCANS, [preset(INPUT), preset(OUTPUT)]
+        )
+    ]
+    training = Training(model, held_out, size.rate, [epoch * per_epoch for epoch in size.halve_after], run)
+    scans: DataLoader[int] = DataLoader(range(number, len(held_out), processes), batch_size=None)  # type: ignore[arg-type]
+    best = ModelCheckpoint(folder, "best", monitor="val/iou", mode="max", enable_version_counter=False)
+    last = ModelCheckpoint(folder, "last", every_n_train_steps=CHECKPOINT_EVERY, enable_version_counter=False)
     trainer = lightning.Trainer(
         max_steps=steps,
-        precision="bf16-mixed",
+        precision=PRECISION,
         accelerator=device.type,
-        devices=1,
-        val_check_interval=VALIDATE_EVERY,
+        **_processes(processes),
+        use_distributed_sampler=False,
+        val_check_interval=min(VALIDATE_EVERY, steps),
         num_sanity_val_steps=0,
         log_every_n_steps=10,
-        logger=CSVLogger(out, name=name, version=f"from-step-{start}"),
-        callbacks=[
-            ModelCheckpoint(last.parent, last.stem, every_n_train_steps=CHECKPOINT_EVERY, enable_version_counter=False),
-            TQDMProgressBar(),
-        ],
+        default_root_dir=folder,
+        logger=[kind(out, name=name, version=f"from-step-{start}") for kind in (CSVLogger, TensorBoardLogger)],
+        callbacks=[best, last, TQDMProgressBar()],
         enable_model_summary=False,
     )
-    trainer.fit(training, DataLoader(rays, batch_size=None), scans, ckpt_path=last if start else None)
+    trainer.fit(
+        training, DataLoader(samples, batch_size=None), scans, ckpt_path=folder / "last.ckpt" if start else None
+    )
     if trainer.interrupted:
         raise KeyboardInterrupt
-    figures = {key: round(value, 4) for key, value in trainer.validate(training, scans, verbose=False)[0].items()}
-    models.save(model, out / f"{name}.safetensors", name, arguments, **run, held_out=figures)
-    last.unlink(missing_ok=True)
+    figures = _validate(trainer, training, scans)
+    if best.best_model_score is not None and best.best_model_score > figures["val/iou"]:
+        state = torch.load(best.best_model_path, weights_only=True, map_location="cpu")
+        training.load_state_dict(state["state_dict"])
+        figures = _validate(trainer, training, scans)
+    if trainer.is_global_zero:
+        models.save(model, out / f"{name}.safetensors", name, arguments, **run, held_out=figures)
+        for file in folder.glob("*.ckpt"):
+            file.unlink()
     return figures
+
+
+def _samples(
+    size: Preset,
+    stored: data.Archive | data.RangeImageTree | None,
+    seed: int,
+    start: int,
+    part: tuple[int, int],
+    device: torch.device,
+) -> data.ContinuousRays | data.StoredImages:
+    if stored is None:
+        streets = [data.street(town, 0, device) for town in size.towns]
+        return data.ContinuousRays(streets, preset(INPUT), size.crops, size.columns, size.queries, seed, start, part)
+    # As many columns and as many queries as the crops have.
+    scans = size.crops * size.columns // preset(INPUT).shape[1]
+    return data.StoredImages(
+        stored, INPUT_SIZE, TARGET_SIZE, scans, size.crops * size.queries // scans, seed, start, part
+    )
+
+
+def _processes(number: int) -> dict[str, Any]:
+    """How Lightning is told of the processes that `torchrun` started."""
+    if number == 1:
+        return {"devices": 1}
+    here = int(os.environ["LOCAL_WORLD_SIZE"])
+    return {"strategy": "ddp", "devices": here, "num_nodes": number // here}
+
+
+def _validate(trainer: lightning.Trainer, training: Training, scans: DataLoader[int]) -> dict[str, float]:
+    return {key: round(value, 4) for key, value in trainer.validate(training, scans, verbose=False)[0].items()}
 
 
 def _steps_done(checkpoint: Path, run: dict[str, Any]) -> int:

@@ -1,13 +1,26 @@
 """Procedural towns: streets of triangles to drive a simulated LiDAR through."""
 
+from ilnet.towns import town01, town02, town03, town04, town05, town06, town07, town10
+from ilnet.towns.plan import raise_town
 from ilnet.towns.town import Town
-from ilnet.towns.town01 import plan as _town01
 from ilnet.towns.traffic import traffic
 
-__all__ = ["NAMES", "Town", "build", "traffic"]
+__all__ = ["NAMES", "TEST", "TRAIN", "WAYPOINTS", "Town", "build", "traffic"]
 
-_PLANS = {"town01": _town01}
-NAMES = tuple(_PLANS)
+# plans, and how many waypoints to keep: 22,244 in the towns to train in and 2,847 in those to test in, as in the paper
+_TOWNS = {
+    "town01": (town01.PLAN, 3050),
+    "town02": (town02.PLAN, 2620),
+    "town03": (town03.PLAN, 3450),
+    "town04": (town04.PLAN, 4930),
+    "town05": (town05.PLAN, 5224),
+    "town06": (town06.PLAN, 2970),
+    "town07": (town07.PLAN, 1385),
+    "town10": (town10.PLAN, 1462),
+}
+NAMES = tuple(_TOWNS)
+TRAIN, TEST = NAMES[:6], NAMES[6:]
+WAYPOINTS = {name: count for name, (_, count) in _TOWNS.items()}
 
 
 def build(name: str, seed: int = 0) -> Town:
@@ -20,6 +33,7 @@ def build(name: str, seed: int = 0) -> Town:
     Raises:
         ValueError: for an unknown name.
     """
-    if name not in _PLANS:
+    if name not in _TOWNS:
         raise ValueError(f"name is {name!r}, should be one of: {', '.join(NAMES)}")
-    return _PLANS[name](seed)
+    plan, waypoints = _TOWNS[name]
+    return raise_town(plan, name, seed, waypoints)

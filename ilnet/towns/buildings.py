@@ -6,9 +6,9 @@ from numpy.typing import ArrayLike
 from ilnet.towns.furniture import railing
 from ilnet.towns.parts import Part, boxes, loft, merge, place, quads, shift, tubes
 
-__all__ = ["block", "house", "shed", "wall"]
+__all__ = ["barn", "block", "church", "hall", "house", "shed", "tower", "wall"]
 
-_FOOTING = 2.0  # walls go this deep, so that sloping ground never opens a gap [m]
+_FOOTING = 4.0  # walls go this deep, so that sloping ground never opens a gap [m]
 _SEEN = 24.0  # no ray of a street LiDAR meets a wall higher than this within its range [m]
 
 
@@ -319,6 +319,10 @@ def block(rng: np.random.Generator, width: float, depth: float, floors: int, gro
         low = np.column_stack([x - 0.28, 0 * x + 0.02, 0 * x - _FOOTING])
         parts += [ceiling, boxes(low, np.column_stack([x + 0.28, 0 * x + 0.55, 0 * x + first]))]
         parts.append(boxes([-h, 0, first - 0.45], [h, 0.5, first]))
+    if ground_floor != "flats" and rng.random() < 0.6:  # a sign on a bracket
+        plate = boxes([-0.04, -0.95, -0.3], [0.04, -0.25, 0.6])
+        bracket = tubes([0, 0, 0.5], [0, -0.3, 0.5], 0.02, sides=3, caps=False)
+        parts.append(shift(merge([plate, bracket]), rng.uniform(-0.4, 0.4) * width, 0.0, first))
     if ground_floor == "shops" and rng.random() < 0.7:  # a shop sign and awnings
         parts.append(boxes([-width / 2 + 0.3, -0.18, first - 0.75], [width / 2 - 0.3, 0, first - 0.2]))
         for x in np.arange(-width / 2 + 1.0, width / 2 - 3.4, 4.4)[: int(rng.integers(0, 4))]:
@@ -327,7 +331,7 @@ def block(rng: np.random.Generator, width: float, depth: float, floors: int, gro
             parts.append(
                 quads([[[x, -1.1, z - 0.45], [x + 3, -1.1, z - 0.45], [x + 3, -1.1, z - 0.65], [x, -1.1, z - 0.65]]])
             )
-    if ground_floor in ("flats", "passage") and len(row) > 2 and rng.random() < 0.7:
+    if len(row) > 2 and rng.random() < (0.7 if ground_floor in ("flats", "passage") else 0.35):
         proto = _balcony(min(pitch - 0.3, 3.4), rng.uniform(1.0, 1.5), solid=rng.random() < 0.5)
         x = row[:, :2].mean(1) - width / 2
         pick = np.arange(len(x)) % int(rng.integers(3, 5)) == 1
@@ -350,3 +354,148 @@ def block(rng: np.random.Generator, width: float, depth: float, floors: int, gro
         tubes(np.column_stack([x, x * 0 - 0.08, x * 0]), np.column_stack([x, x * 0 - 0.08, x * 0 + top]), 0.05, sides=5)
     )
     return merge(parts)
+
+
+def hall(rng: np.random.Generator, width: float, depth: float, height: float) -> Part:
+    """A warehouse or factory hall: roller doors, some of them open, ribs, a row of high windows, docks or a canopy.
+
+    Args:
+        rng: source of the variety.
+        width: along the street, metres.
+        depth: metres.
+        height: of the walls, metres.
+    """
+    doors = _windows(width, rng.uniform(6, 9), (rng.uniform(3.2, 4.2), rng.uniform(3.6, 4.4)), 0.05)
+    doors = doors[rng.random(len(doors)) < 0.7]
+    dock = rng.random() < 0.5
+    if dock:  # doors a lorry backs up to
+        doors[:, 2:] += (1.1, 0.0)
+    depths = rng.choice([0.25, 0.5, 7.0], len(doors), p=[0.5, 0.3, 0.2])
+    high = _windows(width, 5.0, (3.4, 1.1), height - 1.9)
+    if height < 7.5:
+        high = high[:0]
+    walls = [wall(width, -_FOOTING, height, np.concatenate([doors, high]), np.append(depths, np.full(len(high), 0.15)))]
+    for length in (depth, width, depth):
+        row = _windows(length, 6.0, (3.0, 1.2), height - 2.4)
+        walls.append(wall(length, -_FOOTING, height, row, 0.15))
+    parts = [_around(walls, width, depth)]
+    x = np.arange(-width / 2 + 0.1, width / 2, 5.0)
+    free = ~((x[:, None] > doors[:, 0] - width / 2 - 0.3) & (x[:, None] < doors[:, 1] - width / 2 + 0.2)).any(1)
+    low = np.column_stack([x, 0 * x - 0.12, 0 * x - 1.0])[free]
+    parts.append(boxes(low, np.add(low, (0.2, 0.14, height + 1.0))))
+    kind = rng.random()
+    if kind < 0.35:
+        parts.append(_flat_roof(width, depth, height, rng.uniform(0.4, 1.2)))
+        low = np.column_stack([rng.uniform(-0.4, 0.3, 3) * width, rng.uniform(0.2, 0.7, 3) * depth, np.full(3, height)])
+        parts.append(boxes(low, np.add(low, (2.4, 1.8, 1.5))))
+    elif kind < 0.7:
+        parts.append(_gable_roof(width, depth, height, 0.09 * depth, 0.3, 0.2))
+    else:  # saw teeth
+        count = max(2, round(width / 8))
+        edge = np.linspace(-width / 2, width / 2, count + 1)
+        tooth = np.zeros((count, 2, 3, 3))
+        tooth[:, 1, :, 1] = depth
+        tooth[..., 0] = np.stack([edge[:-1], edge[1:], edge[1:]], 1)[:, None]
+        tooth[..., 2] = height + np.array([0.0, 0.0, 2.2])
+        a, b, c = tooth[:, :, 0], tooth[:, :, 1], tooth[:, :, 2]
+        parts.append(quads(np.stack([a[:, 0], c[:, 0], c[:, 1], a[:, 1]], 1)))
+        parts.append(quads(np.stack([b[:, 0], c[:, 0], c[:, 1], b[:, 1]], 1)))
+        parts.append(Part(tooth.reshape(-1, 3), np.arange(6 * count).reshape(-1, 3)))
+    if dock:
+        buffers = np.column_stack([doors[:, :2].mean(1) - width / 2, 0 * doors[:, 0], 0 * doors[:, 0]])
+        parts.append(place(boxes([[-2.1, -0.35, 0.6], [1.7, -0.35, 0.6]], [[-1.7, 0, 1.1], [2.1, 0, 1.1]]), buffers))
+    elif rng.random() < 0.6:
+        reach = rng.uniform(2.0, 4.5)
+        parts.append(boxes([-width / 2 + 1, -reach, 5.0], [width / 2 - 1, 0, 5.3]))
+        x = np.arange(-width / 2 + 1.5, width / 2 - 1, 7.0)
+        posts = np.column_stack([x, 0 * x - reach + 0.3, 0 * x - 0.5])
+        parts.append(tubes(posts, np.add(posts, (0, 0, 5.5)), 0.1, sides=6))
+    return merge(parts)
+
+
+def barn(rng: np.random.Generator, width: float, depth: float) -> Part:
+    """A barn with a steep roof, a tall gate and slits, or open to the front on posts."""
+    height = rng.uniform(3.6, 5.0)
+    roof = _gable_roof(width, depth, height, rng.uniform(0.3, 0.42) * depth, 0.5, 0.4)
+    if rng.random() < 0.35:
+        back = [wall(w, -_FOOTING, height, [], 0.0) for w in (depth, width, depth)]
+        at = [(width / 2, 0, 0), (width / 2, depth, 0), (-width / 2, depth, 0)]
+        walls = [place(w, p, (k + 1) * np.pi / 2) for k, (w, p) in enumerate(zip(back, at, strict=True))]
+        x = np.linspace(-width / 2 + 0.2, width / 2 - 0.2, max(3, round(width / 4.5)))
+        posts = np.column_stack([x, 0 * x + 0.15, 0 * x - 1.0])
+        bales = tubes([[0, 0, 0.7]], [[0, 1.2, 0.7]], 0.7, sides=10)
+        stack = np.column_stack([np.arange(4) * 1.5 - width / 4, np.full(4, depth - 3.0), np.zeros(4)])
+        return merge(
+            [*walls, tubes(posts, np.add(posts, (0, 0, height + 1)), 0.13, sides=6), roof, place(bales, stack)]
+        )
+    gate = [[width / 2 - 1.9, width / 2 + 1.9, 0.0, height - 0.3]]
+    slits = _windows(width, 3.2, (0.25, 1.0), 1.8)
+    slits = slits[np.abs(slits[:, :2].mean(1) - width / 2) > 2.3]
+    front = wall(
+        width, -_FOOTING, height, np.concatenate([gate, slits]), [rng.choice([0.3, 5.0]), *([0.3] * len(slits))]
+    )
+    others = [wall(w, -_FOOTING, height, _windows(w, 3.4, (0.25, 1.0), 1.8), 0.3) for w in (depth, width, depth)]
+    return merge([_around([front, *others], width, depth), roof])
+
+
+def church(rng: np.random.Generator) -> Part:
+    """A church: a tower with a spire over the porch, a nave behind it with buttresses and tall windows."""
+    side, width, depth = rng.uniform(6.0, 7.5), rng.uniform(11, 14), rng.uniform(24, 30)
+    top, height = rng.uniform(17, 22), rng.uniform(8.0, 9.5)
+    belfry = [[side / 2 - 1.0, side / 2 + 1.0, top - 4.5, top - 1.5]]
+    porch = [[side / 2 - 1.2, side / 2 + 1.2, 0.3, 4.0]]
+    slit = [[side / 2 - 0.3, side / 2 + 0.3, 7.0, 9.5]]
+    tower = _around(
+        [
+            wall(
+                side,
+                -_FOOTING,
+                top,
+                [*(porch if k == 0 else []), *slit, *belfry],
+                [*([1.5] if k == 0 else []), 0.4, 0.8],
+            )
+            for k in range(4)
+        ],
+        side,
+        side,
+    )
+    spire = tubes([0, side / 2, top], [0, side / 2, top + 14], side / 2 * 1.35, 0.05, sides=8)
+    windows = _windows(depth, 4.2, (1.3, 4.2), 2.2)
+    nave = [
+        wall(w, -_FOOTING, height, windows if k % 2 else [], 0.5) for k, w in enumerate((width, depth, width, depth))
+    ]
+    roof = place(_gable_roof(depth, width, height, 0.55 * width, 0.4, 0.2), (width / 2, depth / 2, 0), np.pi / 2)
+    y = np.linspace(0.3, depth - 0.9, len(windows) + 1)
+    low = np.concatenate(
+        [np.column_stack([np.full(len(y), s), y, np.full(len(y), -1.0)]) for s in (-width / 2 - 0.9, width / 2)]
+    )
+    buttresses = boxes(low, np.add(low, (0.9, 0.6, height - 0.5)))
+    steps = boxes([[-3, -1.8, -0.6], [-2.6, -1.2, -0.6]], [[3, 0, 0.15], [2.6, 0, 0.3]])
+    return merge([tower, spire, steps, shift(merge([_around(nave, width, depth), roof, buttresses]), y=side - 0.5)])
+
+
+def tower(rng: np.random.Generator, width: float, depth: float, floors: int, ground_floor: str) -> Part:
+    """A tower that stands back on a podium of shops; above what rays reach it is a shaft with bands.
+
+    Args:
+        rng: source of the variety.
+        width: along the street, metres.
+        depth: metres.
+        floors: storeys in all.
+        ground_floor: as for `block`.
+    """
+    podium = block(rng, width, depth, int(rng.integers(2, 6)), ground_floor, "flat")
+    base = float(podium.vertices[:, 2].max())
+    top, inset = 3.2 * floors, rng.uniform(1.5, 4.0, 3)
+    low, high = (
+        np.array([-width / 2 + inset[0], inset[1], 5.0]),
+        np.array([width / 2 - inset[0], depth - inset[2], top]),
+    )
+    z = np.arange(base + 0.5, top, rng.choice([3.2, 6.4, 9.6]))[:, None]
+    out = np.array([0.25, 0.25, 0.0])
+    bands = boxes(
+        np.column_stack([np.repeat((low - out)[None, :2], len(z), 0), z]),
+        np.column_stack([np.repeat((high + out)[None, :2], len(z), 0), z + 0.9]),
+    )
+    cap = boxes([low[0] + 3, low[1] + 3, top], [high[0] - 3, high[1] - 3, top + rng.uniform(2, 5)])
+    return merge([podium, boxes(low, high), bands, cap])

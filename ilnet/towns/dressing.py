@@ -1,30 +1,35 @@
 """What lines the streets and stands on them: lamps, trees, signs, wires, and where one may park and walk."""
 
+from itertools import pairwise
+
 import numpy as np
 
-from ilnet.towns import furniture, plants
+from ilnet.towns import furniture, plants, structures
 from ilnet.towns.parts import Part
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Street
 
-__all__ = ["dress_street", "greenery", "plant_fields", "signals"]
+__all__ = ["Greens", "dress_street", "greenery", "plant_fields", "signals"]
 
 
-def greenery(rng: np.random.Generator) -> dict[str, list[Part]]:
+Greens = dict[str, list[Part]]
+
+
+def greenery(rng: np.random.Generator) -> Greens:
     """Prototypes of plants: of the street ("tall"), of gardens ("small"), of the distance ("far"), and others."""
     return {
         "tall": [
-            plants.tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 500, (0.22, 0.42), twigs=3)
+            plants.tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 1000, (0.14, 0.33), twigs=4)
             for _ in range(5)
         ],
         "small": [
-            plants.tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 340, (0.17, 0.35)) for _ in range(4)
+            plants.tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 560, (0.13, 0.29)) for _ in range(4)
         ],
         "bare": [plants.tree(rng, rng.uniform(7, 10), rng.uniform(2.2, 3.0), 3.3, 0, (0, 0)) for _ in range(2)],
         "conifer": [plants.conifer(rng, rng.uniform(6, 11), 420) for _ in range(2)],
         "bush": [plants.bush(rng, rng.uniform(0.6, 1.1), 110) for _ in range(4)],
         "far": [
-            plants.tree(rng, rng.uniform(9, 14), rng.uniform(3.2, 4.5), 1.5, 230, (0.55, 0.9), twigs=0)
+            plants.tree(rng, rng.uniform(9, 14), rng.uniform(3.2, 4.5), 1.5, 420, (0.4, 0.75), twigs=1)
             for _ in range(3)
         ],
     }
@@ -34,17 +39,23 @@ def _pick(parts: list[Part], rng: np.random.Generator) -> Part:
     return parts[int(rng.integers(0, len(parts)))]
 
 
-def _spread(street: Street, right: float, first: float, step: float, jitter: float, rng: np.random.Generator):
+def _spread(
+    street: Street, right: float, first: float, step: float, jitter: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Stations along a street at a lateral offset: points (N, 2) and headings (N,)."""
     s = np.arange(first, street.length - 2, step)
     return street.at(s + rng.uniform(-jitter, jitter, len(s)), right)
 
 
-def dress_street(site: Site, street: Street, greens: dict[str, list[Part]], rng: np.random.Generator) -> None:
+def dress_street(site: Site, street: Street, greens: Greens, rng: np.random.Generator) -> None:
     """Furnish both pavements, the kerbside parking and the median of a street."""
+    if street.frontage == "highway":
+        _dress_highway(site, street, greens, rng)
+        return
     ground = site.ground
-    open_country = street.frontage == "open"
-    for side in (1, -1):
+    busy = street.frontage in ("shops", "towers", "downtown", "old")
+    country = street.frontage in ("farms", "open")
+    for side in street.sides:
         inward = np.pi / 2 if side > 0 else -np.pi / 2  # turn from the heading to face the carriageway
         lamp = furniture.lamp(rng.uniform(6.0, 8.5), rng.uniform(1.0, 2.2))
         offset = side * (street.half + 0.5)
@@ -61,13 +72,15 @@ def dress_street(site: Site, street: Street, greens: dict[str, list[Part]], rng:
                 pick = keep & (kind == k)
                 site.put(part, xy[pick], heading[pick] + turn, size[pick])
 
-        stand([lamp], 9 if side > 0 else 24, 30, 0.95, offset, inward)
-        stand([furniture.sign(k) for k in range(4)], 14, 23, 0.7, offset, np.pi if side > 0 else 0.0)
+        if not country:
+            stand([lamp], 9 if side > 0 else 24, 30, 0.95, offset, inward)
+        signs = [furniture.sign(k) for k in range(4)]
+        stand(signs, 14, 60 if country else 23, 0.7, offset, np.pi if side > 0 else 0.0)
         wide = side * (street.half + street.pavement - 0.5)
-        if not open_country:
+        if not country:
             stand([furniture.bin_(False), furniture.bin_(True)], 20, 35, 0.6, wide, inward)
-            _walks(site, street, side, rng)
-        if street.frontage in ("shops", "towers"):
+        _walks(site, street, side, 24.0 if country else 4.0, rng)
+        if busy:
             stand([furniture.bench()], 16, 41, 0.7, wide, inward)
             stand([furniture.bollard()], 3, 2.2, 0.25, offset, 0.0)
             stand([furniture.bus_shelter()], 45, 150, 1.0, wide, inward)
@@ -76,6 +89,8 @@ def dress_street(site: Site, street: Street, greens: dict[str, list[Part]], rng:
             stand(trees, 7, rng.uniform(12, 18), 0.75, side * (street.half + 0.9), rng.uniform(0, 6), (0.95, 1.15))
         if street.parking:
             _parking(site, street, side, rng)
+        if country:
+            _verge(site, street, side, greens, rng)
     if street.median:
         s = np.arange(4, street.length - 4, 2.0)
         xy, _ = street.at(s, 0.0)
@@ -86,8 +101,67 @@ def dress_street(site: Site, street: Street, greens: dict[str, list[Part]], rng:
         hedge = plants.hedge(rng, 2.0, 0.8, 0.9)
         for k in np.nonzero(inside[:-1] & inside[1:] & (np.arange(len(s) - 1) % 24 < 14))[0]:
             site.run(hedge, 2.0, xy[k : k + 2])
-    if street.frontage in ("houses", "open", "rows") and rng.random() < 0.8:
+    if street.frontage in ("houses", "open", "rows", "cottages", "works", "farms", "hillside") and rng.random() < 0.8:
         _power_line(site, street, rng)
+
+
+def _dress_highway(site: Site, street: Street, greens: Greens, rng: np.random.Generator) -> None:
+    """Guard rails, a concrete barrier on the median, masts, gantries, posts and shrubs beside a highway."""
+    ground = site.ground
+
+    def line(right: float, first: float = 2.0, step: float = 4.0) -> tuple[np.ndarray, np.ndarray]:
+        return street.at(np.arange(first, street.length - 2, step), right)
+
+    for side in street.sides:
+        xy, heading = line(side * (street.half + 0.7))
+        site.run(structures.guard_rail(), 4.0, xy if side < 0 else xy[::-1], 0.45)
+        xy, heading = line(side * (street.half + 0.4), 10, 25)
+        site.put(furniture.bollard(), xy[ground.edge(xy) > 0.3], heading[0])
+        xy, heading = line(side * (street.half + 1.6), 30, 110)
+        clear = ground.edge(xy) > 1.0
+        site.put(furniture.sign(2, 2.9), xy[clear], heading[clear] + (np.pi if side > 0 else 0.0), 1.5)
+        xy, _ = street.at(np.arange(5, street.length - 5, 3.0), side * (street.half + rng.uniform(4, 9)))
+        for at in xy[(ground.edge(xy) > 2.5) & ~site.taken(xy) & (rng.random(len(xy)) < 0.4)]:
+            kind = str(rng.choice(["bush", "small", "tall"], p=[0.6, 0.2, 0.2]))
+            site.put(_pick(greens[kind], rng), at + rng.uniform(-1.5, 1.5, 2), rng.uniform(0, 6), rng.uniform(0.8, 1.5))
+    if street.median:
+        xy, heading = line(0.0)
+        site.run(structures.concrete_barrier(), 4.0, xy, 0.5)
+        xy, heading = line(0.0, 20, 45)
+        inside = ground.edge(xy) > 0.5
+        for turn in (0.5, -0.5):
+            site.put(furniture.lamp(10.5, 2.4), xy[inside], heading[inside] + turn * np.pi)
+        span = 2 * street.half + 2.4
+        for s in (0.27, 0.58, 0.82):
+            at, heading = street.at(np.array([s * street.length]), 0.0)
+            site.put_at(structures.gantry(span), [*at[0], float(ground.height(at)[0])], heading)
+
+
+def _verge(site: Site, street: Street, side: int, greens: Greens, rng: np.random.Generator) -> None:
+    """What bounds the fields along a lane, in stretches: walls, hedges, banks, fences, rows of trees, or nothing."""
+    s = street.tails[0]
+    while s < street.length - street.tails[1]:
+        length = rng.uniform(25, 70)
+        xy, _ = street.at(
+            np.arange(s, min(s + length, street.length), 4.0), side * (street.half + rng.uniform(1.7, 3.0))
+        )
+        kind = str(rng.choice(["wall", "hedge", "bank", "fence", "trees", "none"]))
+        panel = {
+            "wall": lambda: (structures.stone_wall(rng, rng.uniform(0.8, 1.3)), 3.0),
+            "hedge": lambda: (plants.hedge(rng, 4.0, rng.uniform(1.0, 2.2), rng.uniform(0.8, 1.4)), 4.0),
+            "bank": lambda: (structures.bank(rng.uniform(0.5, 1.1)), 4.0),
+            "fence": lambda: (structures.post_and_rail(), 2.5),
+        }.get(kind)
+        if panel:
+            for start, end in pairwise(xy):
+                middle = 0.5 * (start + end)
+                if not site.taken(np.array([start, middle, end])).any():
+                    site.run(*panel(), np.array([start, end]), 1.3)
+        if kind in ("trees", "bank"):
+            spots = xy[:: 2 if kind == "trees" else 3]
+            for at in spots[(site.ground.edge(spots) > 1.5) & ~site.taken(spots)]:
+                site.put(_pick(greens["tall"] + greens["bare"], rng), at, rng.uniform(0, 6), rng.uniform(0.8, 1.1))
+        s += length + rng.uniform(4, 9)
 
 
 def _parking(site: Site, street: Street, side: int, rng: np.random.Generator) -> None:
@@ -103,12 +177,13 @@ def _parking(site: Site, street: Street, side: int, rng: np.random.Generator) ->
     site.park(xy[straight], (heading + turn)[straight])
 
 
-def _walks(site: Site, street: Street, side: int, rng: np.random.Generator) -> None:
-    """Places for people on one pavement, where nothing stands in their way."""
-    s = np.arange(3, street.length - 3, 4.0) + rng.uniform(-1.5, 1.5, len(np.arange(3, street.length - 3, 4.0)))
+def _walks(site: Site, street: Street, side: int, step: float, rng: np.random.Generator) -> None:
+    """Places for people on one pavement or verge, where nothing stands in their way."""
+    s = np.arange(3, street.length - 3, step)
+    s = s + rng.uniform(-0.4, 0.4, len(s)) * step
     xy, heading = street.at(s, side * (street.half + rng.uniform(0.95, max(street.pavement - 0.75, 1.0), len(s))))
     edge = site.ground.edge(xy)
-    clear = (edge > 0.5) & (edge < street.pavement) & ~site.taken(xy)
+    clear = (edge > 0.5) & (edge < max(street.pavement, 1.7)) & ~site.taken(xy)
     site.walk(xy[clear], (heading + np.pi * rng.integers(0, 2, len(s)))[clear])
 
 
@@ -149,7 +224,7 @@ def _power_line(site: Site, street: Street, rng: np.random.Generator) -> None:
 
 def _in_sight(site: Site, xy: np.ndarray) -> np.ndarray:
     """Whether points (N, 2) are within a LiDAR's reach of some street."""
-    road = np.concatenate([street.line[::5] for street in site.ground.streets])
+    road = np.concatenate([street.core[::5] for street in site.ground.streets])
     return np.linalg.norm(xy[:, None] - road, axis=-1).min(1) < 85
 
 
@@ -164,10 +239,10 @@ def plant_fields(site: Site, greens: dict[str, list[Part]], radius: float, rng: 
     for at in ring:
         if site.free(at[None], 8.0):
             site.put(_pick(greens["far"], rng), at, rng.uniform(0, 6), rng.uniform(0.7, 1.2))
-    spots = rng.uniform(-0.95 * radius, 0.95 * radius, (500, 2))
+    spots = rng.uniform(-0.95 * radius, 0.95 * radius, (1600, 2))
     spots = spots[(site.ground.edge(spots) > 6) & ~site.taken(spots) & _in_sight(site, spots)]
-    for at in spots[:50]:
-        around = at + 3 * np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
-        if not site.taken(around).any():
-            kind = str(rng.choice(["small", "bush", "conifer", "far", "bare"], p=[0.3, 0.3, 0.1, 0.25, 0.05]))
+    around = 3 * np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
+    for at in spots[:170]:
+        if not site.taken(at + around).any():
+            kind = str(rng.choice(["small", "bush", "conifer", "far", "bare"], p=[0.35, 0.25, 0.1, 0.25, 0.05]))
             site.put(_pick(greens[kind], rng), at, rng.uniform(0, 6), rng.uniform(0.8, 1.3))

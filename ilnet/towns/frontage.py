@@ -1,26 +1,40 @@
-"""Lots along the streets: which building stands where, and its garden."""
+"""Lots along the streets: which building stands where, and its garden, yard or terrace."""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ilnet.towns import buildings, furniture, plants
-from ilnet.towns.parts import Part, boxes
+from ilnet.towns import buildings, furniture, plants, structures
+from ilnet.towns.dressing import Greens
+from ilnet.towns.parts import Part, boxes, merge, shift
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Street
 
 __all__ = ["Lot", "build_lots"]
 
 
-class Lot:
-    """A frame on the ground: origin on the pavement's inner edge, x along the street, y away from it."""
+class Lot(NamedTuple):
+    """A frame on the ground: x along the street, y away from it."""
 
-    def __init__(self, street: Street, along: float, side: int, setback: float):
-        """Stand at arc length `along` on the right (side 1) or left (side -1), `setback` metres off the pavement."""
+    origin: np.ndarray
+    """(2,) on the pavement's inner edge or behind it, metres."""
+    yaw: float
+    """Of x, rad counter-clockwise."""
+
+    @classmethod
+    def beside(cls, street: Street, along: float, side: int, setback: float) -> "Lot":
+        """Returns the frame at arc length `along` on the right (side 1) or left (-1), `setback` m off the pavement."""
         xy, heading = street.at(np.array([along]), side * (street.half + street.pavement + setback))
-        self.origin = xy[0]
-        self.yaw = float(heading[0]) + (np.pi if side > 0 else 0.0)
+        return cls(xy[0], float(heading[0]) + (np.pi if side > 0 else 0.0))
 
-    def world(self, xy: object) -> np.ndarray:
-        """Points (N, 2) of the lot's frame in the town's frame."""
+    def moved(self, x: float, y: float) -> "Lot":
+        """Returns the frame with its origin at (x, y) of this one."""
+        return Lot(self.world([x, y])[0], self.yaw)
+
+    def world(self, xy: ArrayLike) -> np.ndarray:
+        """Returns points (N, 2) of the lot's frame in the town's frame."""
         x, y = np.atleast_2d(np.asarray(xy, dtype=np.float64)).T
         cos, sin = np.cos(self.yaw), np.sin(self.yaw)
         return self.origin + np.column_stack([cos * x - sin * y, sin * x + cos * y])
@@ -41,7 +55,7 @@ def _boundary(rng: np.random.Generator) -> tuple[Part, float] | None:
 
 
 def _garden(
-    site: Site, lot: Lot, width: float, setback: float, depth: float, greens: dict[str, list[Part]], rng
+    site: Site, lot: Lot, width: float, setback: float, depth: float, greens: Greens, rng: np.random.Generator
 ) -> None:
     """Front edge with a gap for the door and the drive, side edges, plants, a place for a car, bins."""
     half = width / 2
@@ -55,20 +69,23 @@ def _garden(
     side = _boundary(rng)
     if side:
         site.run(*side, lot.world([[-half, front], [-half, depth + 8]]))
+        back = lot.world([[-half, depth + 8], [half, depth + 8]])
+        if not site.taken(back).any():
+            site.run(*side, back)
     if drive and setback > 4:
         y = -setback / 2 + rng.uniform(-0.2, 1.5)
         if site.free(lot.world([[half - 1.6, y - 2.2], [half - 1.6, y], [half - 1.6, y + 2.2]]), 0.9):
             site.park(lot.world([half - 1.6, y]), lot.yaw + np.pi / 2 + np.pi * int(rng.integers(0, 2)))
-    for _ in range(int(rng.integers(1, 5))):
+    for _ in range(int(rng.integers(1, 5)) if setback > 2 else 0):
         spot = lot.world([rng.uniform(-half, half - 3.5), rng.uniform(front + 0.6, -0.6)])
         bush = greens["bush"][int(rng.integers(0, len(greens["bush"])))]
-        if setback > 2 and site.ground.edge(spot)[0] > 1.7:
+        if site.ground.edge(spot)[0] > 1.7:
             site.put(bush, spot, rng.uniform(0, 6), rng.uniform(0.6, 1.3))
-    for _ in range(int(rng.integers(0, 3))):
-        spot = lot.world(
-            [rng.uniform(-half, half), rng.choice([rng.uniform(front + 1.5, -1.5), depth + rng.uniform(3, 9)])]
-        )
-        if setback > 4 and site.free(spot, 3.5):
+    for _ in range(int(rng.integers(0, 5))):
+        behind = setback < 4 or rng.random() < 0.6
+        y = depth + rng.uniform(3, 12) if behind else rng.uniform(front + 1.5, -1.5)
+        spot = lot.world([rng.uniform(-half, half), y])
+        if site.free(spot, 3.5):
             trees = greens["conifer" if rng.random() < 0.25 else "small"]
             tree = trees[int(rng.integers(0, len(trees)))]
             site.put(tree, spot, rng.uniform(0, 6), rng.uniform(0.75, 1.15))
@@ -76,6 +93,248 @@ def _garden(
         spot = lot.world([[half - 0.6, front + 0.5], [half - 1.4, front + 0.6]])
         spot = spot[site.ground.edge(spot) > 0.5]
         site.put(furniture.bin_(True), spot, lot.yaw - np.pi / 2)
+
+
+class _Size(NamedTuple):
+    """A building to come, metres: along the street, away from it, storeys, front garden, gap to the next."""
+
+    width: float
+    depth: float
+    floors: int
+    setback: float
+    space: float
+
+
+def _towers(rng: np.random.Generator) -> Iterator[_Size]:
+    while True:
+        width, depth, floors = rng.uniform(17, 30), rng.uniform(13, 17), int(rng.integers(4, 8))
+        setback, space = rng.choice([0.0, 2.0, 5.0]), rng.uniform(5, 24)
+        if rng.random() < 0.25:
+            width, depth, floors = rng.uniform(17, 22), rng.uniform(16, 20), int(rng.integers(9, 15))
+        yield _Size(width, depth, floors, setback, space)
+
+
+def _downtown(rng: np.random.Generator) -> Iterator[_Size]:
+    while True:
+        floors = int(rng.integers(5, 10) if rng.random() < 0.7 else rng.integers(11, 24))
+        setback, space = rng.choice([0.0, 0.0, 0.0, 4.0]), rng.choice([0.0, 0.0, 1.5, 7.0])
+        yield _Size(rng.uniform(15, 32), rng.uniform(14, 22), floors, setback, space)
+
+
+def _shops(rng: np.random.Generator) -> Iterator[_Size]:
+    while True:
+        setback, space = rng.choice([0.0, 0.0, 0.6]), rng.choice([0.0, 0.0, 4.0, 12.0])
+        yield _Size(rng.uniform(10, 20), rng.uniform(11, 15), int(rng.integers(2, 6)), setback, space)
+
+
+def _old(rng: np.random.Generator) -> Iterator[_Size]:
+    while True:
+        depth, setback = rng.uniform(9, 13), rng.choice([0.0, 0.0, 0.4])
+        for left in range(int(rng.integers(3, 9)), 0, -1):
+            space = 0.0 if left > 1 else rng.choice([0.0, 2.2, 3.5])
+            yield _Size(rng.uniform(6, 13), depth, int(rng.integers(3, 6)), setback, space)
+
+
+def _rows(rng: np.random.Generator) -> Iterator[_Size]:
+    while True:
+        width, depth, floors = rng.uniform(5.5, 8.5), rng.uniform(8.5, 11), int(rng.integers(2, 4))
+        setback = rng.choice([0.0, 1.6, 3.0])
+        for left in range(int(rng.integers(3, 7)), 0, -1):
+            yield _Size(width, depth, floors, setback, 0.0 if left > 1 else rng.uniform(4, 13))
+
+
+def _houses(rng: np.random.Generator) -> Iterator[_Size]:
+    while True:
+        width, depth, floors = rng.uniform(8.5, 13), rng.uniform(8, 11), int(rng.integers(1, 3))
+        yield _Size(width, depth, floors, rng.uniform(4, 9.5), rng.uniform(5, 11))
+
+
+def _cottages(rng: np.random.Generator) -> Iterator[_Size]:
+    while True:
+        width, depth, floors = rng.uniform(7, 12), rng.uniform(6, 8.5), int(rng.integers(1, 3))
+        yield _Size(width, depth, floors, rng.choice([0.8, rng.uniform(2, 5), rng.uniform(5, 13)]), rng.uniform(5, 15))
+
+
+def _works(rng: np.random.Generator) -> Iterator[_Size]:
+    while True:
+        width, depth = rng.uniform(24, 52), rng.uniform(20, 34)
+        yield _Size(width, depth, 1, rng.uniform(13, 24), rng.uniform(8, 22))
+
+
+def _farms(rng: np.random.Generator) -> Iterator[_Size]:
+    while True:
+        yield _Size(
+            rng.uniform(9, 14), rng.uniform(7, 9), int(rng.integers(1, 3)), rng.uniform(3, 12), rng.uniform(40, 95)
+        )
+
+
+def _terraced(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:
+    """A house between its neighbours, with a strip of garden in front."""
+    site.put(buildings.house(rng, size.width, size.depth, size.floors, detached=False), lot.origin, lot.yaw)
+    if size.setback > 1 and (edge := _boundary(rng)):
+        front = -size.setback + 0.2
+        site.run(*edge, lot.world([[-size.width / 2, front], [size.width / 4, front]]))
+
+
+def _block(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:
+    """Flats, offices or shops."""
+    ground_floor = str(rng.choice(["shops", "arcade", "passage", "flats"], p=[0.4, 0.15, 0.15, 0.3]))
+    roof = "flat" if size.floors > 5 or rng.random() < 0.5 else "pitched"
+    site.put(buildings.block(rng, size.width, size.depth, size.floors, ground_floor, roof), lot.origin, lot.yaw)
+
+
+def _old_block(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:
+    """A town house with shops or an arcade below, under a pitched roof."""
+    ground_floor = str(rng.choice(["shops", "arcade", "flats"], p=[0.4, 0.35, 0.25]))
+    site.put(buildings.block(rng, size.width, size.depth, size.floors, ground_floor, "pitched"), lot.origin, lot.yaw)
+
+
+def _tower(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:
+    """An office tower or a large block over shops and arcades."""
+    ground_floor = str(rng.choice(["shops", "arcade", "passage"], p=[0.45, 0.4, 0.15]))
+    if size.floors > 9:
+        site.put(buildings.tower(rng, size.width, size.depth, size.floors, ground_floor), lot.origin, lot.yaw)
+    else:
+        site.put(buildings.block(rng, size.width, size.depth, size.floors, ground_floor, "flat"), lot.origin, lot.yaw)
+
+
+def _villa(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:
+    """A detached house in its garden, perhaps with a shed."""
+    site.put(buildings.house(rng, size.width, size.depth, size.floors, detached=True), lot.origin, lot.yaw)
+    _garden(site, lot, size.width + size.space, size.setback, size.depth, greens, rng)
+    if rng.random() < 0.5:
+        width, depth = (float(v) for v in rng.uniform(3, 6, 2))
+        at = lot.moved(size.width / 2 + rng.uniform(0.5, 2) + width / 2, rng.uniform(0, size.depth))
+        if _try(site, at, width, depth, 1.0):
+            site.put(buildings.shed(rng, width, depth, rng.uniform(2.3, 3)), at.origin, at.yaw)
+
+
+def _terrace(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:
+    """A detached house where the ground rises from the street: on a terrace behind a retaining wall, with steps."""
+    half, front = (size.width + 0.7 * size.space) / 2, -size.setback + 0.3
+    low, high = site.ground.height(lot.world([[0, front], [0, size.depth + 2]]))
+    lift = min(high - low, 2.8)
+    plot = site.footprint(lot.moved(0, front).origin, lot.yaw, 2 * half, size.depth + 2.5 - front)
+    if lift < 0.4 or site.ground.edge(plot).min() < 1.0:
+        _villa(site, lot, size, greens, rng)
+        return
+    count = int(np.ceil(lift / 0.18))
+    x, one = rng.uniform(-0.5, 0.3) * half + 0.3 * np.arange(count), np.ones(count)
+    steps = boxes(
+        np.column_stack([x, (front - 0.9) * one, -0.6 * one]),
+        np.column_stack([x + 0.3, front * one, lift / count * (1 + np.arange(count))]),
+    )
+    parts = [boxes([-half, front, -4.0], [half, size.depth + 2.5, lift]), steps]
+    for start, end in ((-half, x[0] - 0.1), (x[-1] + 1.4, half)):
+        if end - start > 1:
+            parts.append(shift(furniture.railing(end - start), start, front + 0.15, lift))
+    parts.append(shift(buildings.house(rng, size.width, size.depth, size.floors, detached=True), z=lift))
+    for _ in range(int(rng.integers(1, 5))):
+        bush = greens["bush"][int(rng.integers(0, len(greens["bush"])))]
+        parts.append(shift(bush, rng.uniform(-half + 1, half - 1), rng.uniform(front + 0.9, -1.0), lift))
+    at = np.append(lot.origin, low)  # the wall stands on the street's level, and not on that of the house
+    site.put_at(merge(parts), at, lot.yaw)
+    site.claim(plot)
+
+
+def _factory(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:
+    """A hall behind a yard with a fence, a gate, and what is stored there."""
+    height = rng.uniform(6.0, 10.5)
+    site.put(buildings.hall(rng, size.width, size.depth, height), lot.origin, lot.yaw)
+    half, front = size.width / 2 + 0.4 * size.space, -size.setback + 0.4
+    gate = rng.uniform(-0.3, 0.3) * half
+    concrete = boxes([0, -0.1, -0.4], [3.0, 0.1, 1.9])
+    panel = (structures.mesh_fence() if rng.random() < 0.8 else concrete, 3.0)
+    if rng.random() < 0.8:
+        site.run(*panel, lot.world([[-half, front], [gate - 4.5, front]]))
+        site.run(*panel, lot.world([[gate + 4.5, front], [half, front]]))
+        site.put(boxes([-0.25, -0.25, -0.4], [0.25, 0.25, 2.3]), lot.world([[gate - 4.6, front], [gate + 4.6, front]]))
+        for side in (-half, half):
+            site.run(*panel, lot.world([[side, front], [side, size.depth]]))
+    spots = np.arange(-half + 3, half - 3, 2.9)
+    spots = spots[np.abs(spots - gate) > 6]
+    site.park(lot.world(np.column_stack([spots, np.full(len(spots), front + 3.6)])), lot.yaw + np.pi / 2)
+    site.walk(lot.world(np.column_stack([spots[::3], np.full(len(spots[::3]), front + 8.0)])), lot.yaw)
+    for x in np.arange(-half + 4, half - 2, 7.0):
+        kind = rng.random()
+        if site.ground.edge(lot.world([[x, -1.0], [x, -14.0]])).min() < 2.0:
+            continue
+        spot = lot.world([x, -7.2 + rng.uniform(-0.6, 0.3)])
+        if kind < 0.22 and size.setback > 15:
+            site.put(structures.trailer(), spot, lot.yaw - np.pi / 2)
+        elif kind < 0.36:
+            site.put(structures.container(), lot.world([x, -2.2]), lot.yaw + rng.normal(0, 0.03))
+        elif kind < 0.46:
+            stack = merge(
+                [boxes([-0.6, -0.5, 0.15 * k], [0.6, 0.5, 0.15 * k + 0.12]) for k in range(int(rng.integers(3, 10)))]
+            )
+            site.put(stack, lot.world(np.column_stack([x + 1.4 * np.arange(3), np.full(3, -1.5)])), lot.yaw)
+    edge = size.width / 2 + 0.2 * size.space
+    kind = rng.random()
+    if site.ground.edge(lot.world([[edge + 8.0, 6.0], [edge, 0.0]])).min() < 4.0:
+        pass  # a street runs there
+    elif kind < 0.3 and size.space > 14:
+        site.put(structures.tank(2.6, rng.uniform(5, 9)), lot.world([edge + 2.0, 6.0]), lot.yaw)
+    elif kind < 0.5 and size.space > 12:
+        site.put(structures.silo(1.7, rng.uniform(8, 13)), lot.world([[edge, 4.0], [edge, 8.2]]), lot.yaw)
+    elif kind < 0.7:  # an office in front of the hall
+        office = lot.moved(rng.choice([-1, 1]) * (size.width / 2 - 5.5), -5.0)
+        foot = site.footprint(office.origin, office.yaw, 10.0, 5.0)
+        if np.hypot(*(office.origin - lot.world([gate, -5.0])[0])) > 7 and site.ground.edge(foot).min() > 1.0:
+            site.put(
+                buildings.block(rng, 10.0, 5.0, int(rng.integers(2, 4)), "flats", "flat"), office.origin, office.yaw
+            )
+    site.put(furniture.lamp(9.0, 1.8), lot.world([-half + 1.0, front + 1.0]), lot.yaw + np.pi / 2)
+    site.claim(site.footprint(lot.moved(0, front).origin, lot.yaw, 2 * half, size.depth - front))
+
+
+def _farm(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:
+    """A farmhouse; behind and beside it barns, silos, walls, and a paddock."""
+    _villa(site, lot, size, greens, rng)
+    side = rng.choice([-1, 1])
+    for k in range(int(rng.integers(1, 4))):
+        width, depth = rng.uniform(12, 24), rng.uniform(9, 13)
+        at = lot.moved(side * (size.width / 2 + 6 + width / 2 + 3 * k), rng.uniform(-2, 4) + k * 15)
+        if _try(site, at, width, depth, 4.0):
+            site.put(buildings.barn(rng, width, depth), at.origin, at.yaw)
+            yard = at.world([rng.uniform(-0.3, 0.3) * width, -3.5])
+            if site.free(yard, 3.0):
+                site.park(yard, at.yaw + rng.uniform(-0.4, 0.4))
+            if rng.random() < 0.5:
+                spot = at.world([[side * (width / 2 + 3.2), 4.0]])
+                if site.free(spot, 3.0):
+                    site.put(structures.silo(rng.uniform(1.6, 2.4), rng.uniform(7, 12)), spot, lot.yaw)
+    far = -side * (size.width / 2 + rng.uniform(16, 28))
+    near = -side * (size.width / 2 + 3)
+    front, back = -size.setback + 0.8, size.depth + rng.uniform(8, 22)
+    paddock = lot.world([[near, front], [far, front], [far, back], [near, back], [near, front]])
+    site.run(structures.post_and_rail(), 2.5, paddock, 1.2)
+    bales = lot.world(
+        rng.uniform((min(near, far) + 2, 3), (max(near, far) - 2, back - 2), (int(rng.integers(0, 7)), 2))
+    )
+    site.put(structures.bale(), bales[~site.taken(bales)], rng.uniform(0, 3))
+
+
+class _Style(NamedTuple):
+    sizes: Callable[[np.random.Generator], Iterator[_Size]]
+    build: Callable[[Site, Lot, _Size, Greens, np.random.Generator], None]
+    gaps: float = 0.0
+    """How often there is nothing for a while."""
+
+
+_STYLES = {
+    "towers": _Style(_towers, _block),
+    "downtown": _Style(_downtown, _tower),
+    "shops": _Style(_shops, _block),
+    "old": _Style(_old, _old_block),
+    "rows": _Style(_rows, _terraced),
+    "houses": _Style(_houses, _villa),
+    "hillside": _Style(_houses, _terrace),
+    "cottages": _Style(_cottages, _villa, 0.12),
+    "works": _Style(_works, _factory),
+    "farms": _Style(_farms, _farm, 0.4),
+    "open": _Style(_houses, _villa, 0.8),
+}
 
 
 def _try(site: Site, lot: Lot, width: float, depth: float, kerb: float) -> bool:
@@ -87,68 +346,31 @@ def _try(site: Site, lot: Lot, width: float, depth: float, kerb: float) -> bool:
     return True
 
 
-def build_lots(site: Site, street: Street, side: int, greens: dict[str, list[Part]], rng: np.random.Generator) -> None:
-    """Fill one side of a street with buildings, after its frontage.
+def build_lots(site: Site, street: Street, side: int, greens: Greens, rng: np.random.Generator) -> None:
+    """Fill one side of a street with buildings, after its frontage; one that names no style stays empty.
 
     Args:
         site: where to build.
-        street: its `frontage` is "towers", "shops", "rows", "houses" or "open".
+        street: its `frontage` is a key of the styles above, or another word.
         side: 1 right, -1 left.
         greens: prototypes under "bush", "small", "conifer".
         rng: source of the variety.
     """
-    style = street.frontage
-    kerb = street.pavement - 0.3
-    along = rng.uniform(2, 8)
-    row_setback = rng.choice([0.0, 1.6, 3.0])
-    row: tuple[float, float, int] | None = None
-    left_in_row = 0
-    while along < street.length - 4:
-        if style == "open" and rng.random() < 0.8:
+    if street.frontage not in _STYLES:
+        return
+    style = _STYLES[street.frontage]
+    sizes = style.sizes(rng)
+    end = street.length - street.tails[1]
+    along = street.tails[0] + rng.uniform(2, 8)
+    while along < end - 4:
+        if rng.random() < style.gaps:
             along += rng.uniform(10, 30)
             continue
-        if style == "rows":
-            if left_in_row == 0:
-                row = (rng.uniform(5.5, 8.5), rng.uniform(8.5, 11), int(rng.integers(2, 4)))
-                left_in_row = int(rng.integers(3, 7))
-                row_setback = rng.choice([0.0, 1.6, 3.0])
-            assert row is not None
-            width, depth, floors = row
-            setback, space = row_setback, 0.0
-        elif style == "shops":
-            width, depth, floors = rng.uniform(10, 20), rng.uniform(11, 15), int(rng.integers(2, 6))
-            setback, space = rng.choice([0.0, 0.0, 0.6]), rng.choice([0.0, 0.0, 4.0, 12.0])
-        elif style == "towers":
-            width, depth, floors = rng.uniform(17, 30), rng.uniform(13, 17), int(rng.integers(4, 8))
-            setback, space = rng.choice([0.0, 2.0, 5.0]), rng.uniform(5, 24)
-            if rng.random() < 0.25:
-                width, depth, floors = rng.uniform(17, 22), rng.uniform(16, 20), int(rng.integers(9, 15))
-        else:
-            width, depth, floors = rng.uniform(8.5, 13), rng.uniform(8, 11), int(rng.integers(1, 3))
-            setback, space = rng.uniform(4, 9.5), rng.uniform(5, 11)
-        lot = Lot(street, along + width / 2, side, setback)
-        if along + width / 2 > street.length or not _try(site, lot, width, depth, kerb):
+        size = next(sizes)
+        lot = Lot.beside(street, along + size.width / 2, side, size.setback)
+        if along + size.width / 2 > end or not _try(site, lot, size.width, size.depth, street.pavement - 0.3):
             along += 2.0
-            left_in_row = 0
+            sizes = style.sizes(rng)  # a row that was interrupted does not go on
             continue
-        if style == "rows":
-            site.put(buildings.house(rng, width, depth, floors, detached=False), lot.origin, lot.yaw)
-            left_in_row -= 1
-            if setback > 1:
-                edge = _boundary(rng)
-                if edge:
-                    site.run(*edge, lot.world([[-width / 2, -setback + 0.2], [width / 4, -setback + 0.2]]))
-            space = rng.uniform(4, 13) if left_in_row == 0 else 0.0
-        elif style in ("shops", "towers"):
-            ground_floor = rng.choice(["shops", "arcade", "passage", "flats"], p=[0.4, 0.15, 0.15, 0.3])
-            roof = "flat" if floors > 5 or rng.random() < 0.5 else "pitched"
-            site.put(buildings.block(rng, width, depth, floors, str(ground_floor), roof), lot.origin, lot.yaw)
-        else:
-            site.put(buildings.house(rng, width, depth, floors, detached=True), lot.origin, lot.yaw)
-            _garden(site, lot, width + space, setback, depth, greens, rng)
-            if rng.random() < 0.5:
-                shed_width, shed_depth = (float(v) for v in rng.uniform(3, 6, 2))
-                at = Lot(street, along + width + rng.uniform(1, 3), side, setback + depth + rng.uniform(0, 4))
-                if _try(site, at, shed_width, shed_depth, kerb):
-                    site.put(buildings.shed(rng, shed_width, shed_depth, rng.uniform(2.3, 3)), at.origin, at.yaw)
-        along += width + space
+        style.build(site, lot, size, greens, rng)
+        along += size.width + size.space

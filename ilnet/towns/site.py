@@ -46,18 +46,18 @@ class Site:
         position = self.ground.surface(np.asarray(xy, dtype=np.float64).reshape(-1, 2))
         return np.column_stack([position, np.broadcast_to(heading, len(position))])
 
-    def run(self, panel: Part, panel_length: float, path: ArrayLike) -> None:
-        """Repeat a panel that runs along +x from its origin along a path (N, 2), off the carriageways."""
+    def run(self, panel: Part, panel_length: float, path: ArrayLike, kerb: float = 0.9) -> None:
+        """Repeat a panel that runs along +x from its origin along a path (N, 2), `kerb` metres off the carriageways."""
         path = np.asarray(path, dtype=np.float64)
         for start, end in pairwise(path):
-            length = np.linalg.norm(end - start)
+            length = np.hypot(*(end - start))
             if length < 0.5:
                 continue
             count = max(1, round(length / panel_length))
             at = start + (end - start) * (np.arange(count) / count)[:, None]
             stretch = np.array([length / count / panel_length, 1.0, 1.0])
             middle = at + (end - start) / (2 * count)
-            clear = self.ground.edge(middle) > 0.9
+            clear = self.ground.edge(middle) > kerb
             position = np.column_stack([at, self.ground.surface(middle)[:, 2]])[clear]
             if len(position):
                 yaw = np.arctan2(*(end - start)[::-1])
@@ -85,12 +85,24 @@ class Site:
         i, j = np.clip(np.round(points).astype(int) + self.ground.extent, 0, len(self._taken) - 1).T
         self._taken[i, j] = True
 
-    def town(self, name: str, seed: int) -> Town:
-        """Returns what has been built."""
+    def town(self, name: str, seed: int, count: int) -> Town:
+        """Returns what has been built, with at most `count` waypoints."""
         vertices, triangles = self._mesh()
         waypoints, headings = lanes(self.ground)
+        room = self._room(waypoints, vertices)
+        waypoints, headings = waypoints[room], headings[room]
         parking, walks = (raster(np.concatenate([np.zeros((0, 4)), *spots])) for spots in (self._parking, self._walks))
-        return Town(name, seed, vertices, triangles, waypoints, headings, parking, walks)
+        return Town(name, seed, vertices, triangles, waypoints[:count], headings[:count], parking, walks)
+
+    def _room(self, waypoints: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+        """Whether nothing hangs over the lane, a bough say, within 1.3 m of where a car carries its sensor; (N,)."""
+        vertices = vertices[np.abs(vertices[:, :2]).max(1) < self.ground.extent]
+        rise = vertices[:, 2] - self.ground.height(vertices[:, :2])
+        vertices = vertices[(rise > 0.4) & (rise < 3.2)]
+        vertices = vertices[self.ground.edge(vertices[:, :2]) < 0.2]
+        sensors = waypoints + np.array([0, 0, 1.8], dtype=np.float32)
+        nearest = [((vertices - at) ** 2).sum(1).min(initial=9.0) for at in sensors]
+        return np.array(nearest) > 1.3**2
 
     def _mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (V, 3) float32 on a 1/1024 m raster and triangles (F, 3) int32 without slivers."""

@@ -44,8 +44,8 @@ def lanes(ground: Ground) -> tuple[np.ndarray, np.ndarray]:
     points, headings = [], []
     for street in ground.streets:
         for lane in street.lanes:
-            for way in (1, -1):
-                s = np.arange(1.0, street.length - 1.0, 0.1)
+            for way in street.ways:
+                s = np.arange(1.0 + street.tails[0], street.length - 1.0 - street.tails[1], 0.1)
                 xy, heading = street.at(s, way * lane)
                 # even steps along the lane itself, which is longer or shorter than the centreline in a bend
                 driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy, axis=0), axis=1))])
@@ -55,4 +55,4 @@ def lanes(ground: Ground) -> tuple[np.ndarray, np.ndarray]:
                 points.append(np.column_stack([xy, ground.height(xy)])[clear])
                 headings.append((heading if way > 0 else heading + np.pi)[clear])
     turned = np.mod(np.concatenate(headings) + np.pi, 2 * np.pi) - np.pi
-    return raster(np.concatenate(points)), turned.astype(np.float32)
+    return raster(np.concatenate(points)), raster(turned)

@@ -13,7 +13,7 @@ from ilnet.towns.town import Town
 
 __all__ = ["traffic"]
 
-_CARS, _VAN, _LORRY, _CYCLIST, _BICYCLE, _PEOPLE = (0, 1, 2), 3, 4, 5, 6, (7, 8, 9)
+_CARS, _VAN, _LORRY, _BUS, _CYCLIST, _BICYCLE, _PEOPLE = (0, 1, 2), 3, 4, 5, 6, 7, (8, 9, 10)
 # Metres kept free ahead of and behind the sensor, whose own car is not drawn, and to its sides.
 _OWN_CAR = (4.5, 1.3)
 _STRETCH = 1.05  # vehicles differ in length, width and height by up to 5 %
@@ -44,8 +44,9 @@ class _Things(NamedTuple):
 def _fleet() -> tuple[_Kind, ...]:
     """Returns the prototypes, by the numbers above."""
     walkers = [vehicles.pedestrian(*pose) for pose in ((0.7, 0.25), (0.5, 0.15), (0.1, 0.05))]
-    gaps = {_LORRY: 3.5, _CYCLIST: 0.8} | dict.fromkeys((*_CARS, _VAN), 1.0)
-    parts = [*map(vehicles.car, range(3)), vehicles.van(), vehicles.lorry(), vehicles.cyclist(), vehicles.bicycle()]
+    gaps = {_LORRY: 3.5, _BUS: 3.5, _CYCLIST: 0.8} | dict.fromkeys((*_CARS, _VAN), 1.0)
+    heavy = [vehicles.van(), vehicles.lorry(), vehicles.bus()]
+    parts = [*map(vehicles.car, range(3)), *heavy, vehicles.cyclist(), vehicles.bicycle()]
     kinds = []
     for number, part in enumerate(parts + walkers):
         reach = np.abs(part.vertices[:, :2]).max(0) * _STRETCH
@@ -83,7 +84,12 @@ def traffic(
     parking, walks = (
         spots[_distance(spots, sensor) < radius].astype(np.float64) for spots in (town.parking, town.walks)
     )
-    drawn = [_driving(lane, slope, rng), _crossing(lane, rng), _parked(parking, lane, slope, rng), _walking(walks, rng)]
+    drawn = [
+        _driving(lane, slope, walks, rng),
+        _crossing(lane, walks, rng),
+        _parked(parking, lane, slope, rng),
+        _walking(walks, rng),
+    ]
     things = _Things(*(np.concatenate(column) for column in zip(*drawn, strict=True)))
     heading = lane[_distance(lane, sensor).argmin(), 3] if len(lane) else 0.0
     keep = _apart(things, sensor, heading)
@@ -127,25 +133,31 @@ def _aside(spot: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.column_stack([spot[:, :2] + step, spot[:, 2:]])
 
 
-def _driving(lane: np.ndarray, slope: np.ndarray, rng: np.random.Generator) -> _Things:
-    """On the lanes, from an empty road to a slow column; cyclists keep to the right."""
+def _driving(lane: np.ndarray, slope: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> _Things:
+    """On the lanes, from an empty road to a slow column; cyclists keep to the right, and off the highways."""
     spacing = np.exp(rng.uniform(np.log(16), np.log(110)))
     pick = rng.permutation(np.nonzero(rng.random(len(lane)) < 1.8 / spacing)[0])
     lorries, cyclists = rng.uniform(0.03, 0.2), rng.uniform(0.0, 0.12)
     cars = 0.87 - lorries - cyclists
-    share = [0.4 * cars, 0.35 * cars, 0.25 * cars, 0.13, lorries, cyclists]
-    kind = rng.choice([*_CARS, _VAN, _LORRY, _CYCLIST], len(pick), p=share)
+    share = [0.4 * cars, 0.35 * cars, 0.25 * cars, 0.13, 0.8 * lorries, 0.2 * lorries, cyclists]
+    kind = rng.choice([*_CARS, _VAN, _LORRY, _BUS, _CYCLIST], len(pick), p=share)
+    kind = np.where((kind == _CYCLIST) & ~_beside(lane[pick], walks), _CARS[0], kind)
     right = np.where(kind == _CYCLIST, 0.75, rng.uniform(-0.15, 0.15, len(pick)))
     return _things(_aside(lane[pick], right), slope[pick], kind, drives=True)
 
 
-def _crossing(lane: np.ndarray, rng: np.random.Generator) -> _Things:
-    """A few people on the carriageway, square to a lane."""
-    count = min(int(rng.integers(0, 5)), len(lane))
-    spot = lane[rng.integers(0, max(len(lane), 1), count)].reshape(-1, 4)
-    spot = _aside(spot, rng.uniform(-1.5, 1.5, count))
-    spot[:, 3] += np.pi / 2 * rng.choice([-1, 1], count)
-    return _things(spot, 0.0, rng.choice(_PEOPLE, count), drives=False)
+def _crossing(lane: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> _Things:
+    """A few people on the carriageway, square to a lane, where there are pavements."""
+    spot = lane[rng.random(len(lane)) < rng.uniform(0, 5) / max(len(lane), 1)]
+    spot = spot[_beside(spot, walks)]
+    spot = _aside(spot, rng.uniform(-1.5, 1.5, len(spot)))
+    spot[:, 3] += np.pi / 2 * rng.choice([-1, 1], len(spot))
+    return _things(spot, 0.0, rng.choice(_PEOPLE, len(spot)), drives=False)
+
+
+def _beside(lane: np.ndarray, walks: np.ndarray) -> np.ndarray:
+    """Whether people walk within 12 m of points (N, 4) on lanes."""
+    return (np.hypot(*(lane[:, None, k] - walks[None, :, k] for k in (0, 1))) < 12).any(1)
 
 
 def _parked(parking: np.ndarray, lane: np.ndarray, slope: np.ndarray, rng: np.random.Generator) -> _Things:

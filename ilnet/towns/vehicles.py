@@ -6,7 +6,7 @@ import numpy as np
 
 from ilnet.towns.parts import Part, boxes, loft, merge, polyline_tubes, shift, tubes
 
-__all__ = ["bicycle", "car", "cyclist", "lorry", "pedestrian", "van"]
+__all__ = ["bicycle", "bus", "car", "cyclist", "lorry", "pedestrian", "van", "wheels"]
 
 # from the tail to the nose: x, belt height, roof or bonnet height, half width at the belt, half width at the top
 _HATCHBACK = [
@@ -58,7 +58,7 @@ _VAN = [
 ]
 
 
-def _wheels(x: list[float], half_width: float, radius: float, width: float = 0.22) -> Part:
+def wheels(x: list[float], half_width: float, radius: float, width: float = 0.22) -> Part:
     """Pairs of wheels."""
     at = np.array([[px, side * half_width, radius] for px in x for side in (-1, 1)])
     inward = np.array([[0, -side * width, 0] for _ in x for side in (-1, 1)])
@@ -114,7 +114,7 @@ def car(kind: int) -> Part:
     return merge(
         [
             _body(profile, axles, radius, 0.2 + 0.04 * (kind == 2)),
-            _wheels(list(axles), half, radius),
+            wheels(list(axles), half, radius),
             _mirrors(x_mirror, half + 0.08, mirror),
             *rails,
         ]
@@ -124,7 +124,7 @@ def car(kind: int) -> Part:
 def van() -> Part:
     """A panel van, 5.4 m long, 2.4 m high."""
     body = _body(_VAN, (-1.6, 1.75), 0.36, 0.28)
-    return merge([body, _wheels([-1.6, 1.75], 0.98, 0.36), _mirrors(1.55, 1.1, 1.35)])
+    return merge([body, wheels([-1.6, 1.75], 0.98, 0.36), _mirrors(1.55, 1.1, 1.35)])
 
 
 def lorry() -> Part:
@@ -142,8 +142,24 @@ def lorry() -> Part:
     )
     guard = tubes([[-1.2, -1.12, 0.6], [-1.2, 1.12, 0.6]], [[1.9, -1.12, 0.6], [1.9, 1.12, 0.6]], 0.05)
     cargo = boxes([-4.2, -1.22, 1.0], [2.25, 1.22, 3.45])
-    wheels = _wheels([-2.6, 3.2], 1.18, 0.48, 0.3)
-    return merge([_body(cab, (3.2, 3.2), 0.48, 0.5), frame, guard, cargo, wheels, _mirrors(3.75, 1.4, 1.9)])
+    tyres = wheels([-2.6, 3.2], 1.18, 0.48, 0.3)
+    return merge([_body(cab, (3.2, 3.2), 0.48, 0.5), frame, guard, cargo, tyres, _mirrors(3.75, 1.4, 1.9)])
+
+
+def bus() -> Part:
+    """A city bus, 11 m long, 3.1 m high."""
+    body = [
+        (-5.50, 1.3, 2.85, 1.18, 1.08),
+        (-5.42, 1.3, 3.02, 1.25, 1.14),
+        (-2.00, 1.3, 3.10, 1.25, 1.14),
+        (4.90, 1.3, 3.08, 1.25, 1.14),
+        (5.35, 1.2, 2.90, 1.24, 1.12),
+        (5.50, 1.0, 1.60, 1.18, 1.10),
+    ]
+    vents = boxes([[-4.0, -0.7, 3.05], [0.5, -0.7, 3.05]], [[-2.2, 0.7, 3.25], [2.3, 0.7, 3.25]])
+    return merge(
+        [_body(body, (-3.0, 3.0), 0.48, 0.32), wheels([-3.0, 3.0], 1.25, 0.48, 0.3), vents, _mirrors(5.4, 1.4, 2.3)]
+    )
 
 
 def bicycle() -> Part:

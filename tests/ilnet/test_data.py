@@ -1,5 +1,6 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader
@@ -61,7 +62,7 @@ def test_queries_are_the_rays_that_were_cast(streets):
 def test_the_seed_decides(streets):
     first, again, other = (list(zip(range(3), rays(streets, seed), strict=False)) for seed in (1, 1, 2))
     for (_, a), (_, b) in zip(first, again, strict=True):
-        assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+        assert all(torch.equal(x, y) for x, y in zip(a[:3], b[:3], strict=True))
     assert not torch.equal(first[0][1].ranges, other[0][1].ranges)
     assert not torch.equal(first[0][1].ranges, first[1][1].ranges)
 
@@ -138,5 +139,69 @@ def test_any_number_of_workers_gives_the_same_batches(streets, workers):
     alone = [batch for _, batch in zip(range(5), rays(streets), strict=False)]
     loader = iter(DataLoader(rays(streets), batch_size=None, num_workers=workers))
     for batch in alone:
-        for tensor, expected in zip(next(loader), batch, strict=True):
+        for tensor, expected in zip(next(loader)[:3], batch[:3], strict=True):
             assert torch.equal(tensor, expected)
+
+
+def test_parts_of_a_batch_make_up_the_whole():
+    street = data.street("town01")
+
+    def first(part):
+        return next(iter(data.ContinuousRays([street], SENSOR, 4, 64, 50, seed=2, start=3, part=part)))
+
+    whole, halves = first((0, 1)), [first((number, 2)) for number in range(2)]
+    assert torch.equal(whole.queries, torch.cat([half.queries for half in halves]))
+    for field in ("image", "ranges"):  # traffic stands elsewhere in the mesh of a part: millimetres, at edges more
+        difference = getattr(whole, field) - torch.cat([getattr(half, field) for half in halves])
+        assert (difference.abs() > 1e-3).double().mean() < 1e-3
+    with pytest.raises(ValueError, match="batch of 4 cannot be shared out evenly among 3"):
+        first((0, 3))
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    """Five scans of two sizes, whose ranges tell the scan and the pixel."""
+    sensors = {size: SENSOR.resize(*map(int, size.split("x"))) for size in ("4x16", "8x32")}
+    made = data.Archive.create(tmp_path_factory.mktemp("archive") / "a", 5, sensors, {"towns": ["somewhere"]})
+    images = {}
+    for size, sensor in sensors.items():
+        pixels = torch.arange(sensor.shape[0] * sensor.shape[1]).view(sensor.shape) / 16
+        images[size] = made.quantise(size, torch.stack([10 + 10 * scan + pixels for scan in range(5)]).clamp(max=79))
+    zeros = np.zeros(5, np.int32)
+    made.write(0, images, zeros, zeros, np.tile(np.eye(4), (5, 1, 1)))
+    return made
+
+
+def stored(archive, **options):
+    return data.StoredImages(archive, "4x16", "8x32", **{"scans": 2, "queries": 30, "seed": 0, **options})
+
+
+def test_stored_images_give_pixels_of_the_dense_image_where_they_lie_in_the_sparse_one(archive):
+    batch = next(iter(stored(archive)))
+    assert batch.wrap
+    assert [tuple(tensor.shape) for tensor in batch[:3]] == [(2, 4, 16), (2, 30, 2), (2, 30)]
+    for image, queries, ranges in zip(*batch[:3], strict=True):
+        assert len(queries.unique(dim=0)) == 30
+        scan = next(k for k in range(5) if torch.equal(archive.scan(k, "4x16").ranges, image))
+        row, column = (queries * torch.tensor([7 / 3, 2.0])).round().long().unbind(-1)
+        assert torch.equal(archive.scan(scan, "8x32").ranges[row, column], ranges)
+
+
+def test_an_epoch_draws_each_scan_once_and_the_next_in_another_order(archive):
+    batches = [batch for _, batch in zip(range(10), stored(archive, scans=1), strict=False)]
+    drawn = [int((batch.image[0, 0, 0] - 10) / 10) for batch in batches]
+    assert sorted(drawn[:5]) == sorted(drawn[5:]) == list(range(5))
+    assert drawn[:5] != drawn[5:]
+    assert not torch.equal(batches[0].queries, batches[1].queries)
+    later = next(iter(stored(archive, scans=1, start=7)))
+    assert torch.equal(later.queries, batches[7].queries)
+    whole = next(iter(stored(archive)))
+    halves = [next(iter(stored(archive, part=(number, 2)))) for number in range(2)]
+    assert torch.equal(whole.ranges, torch.cat([half.ranges for half in halves]))
+
+
+def test_an_archive_without_the_size_is_refused(archive):
+    with pytest.raises(ValueError, match="no scans of size 9x9; it has 4x16, 8x32"):
+        data.StoredImages(archive, "9x9", "8x32", 1, 1, 0)
+    with pytest.raises(ValueError, match="queries is 257; images of 8x32 have 256 pixels"):
+        stored(archive, queries=257)

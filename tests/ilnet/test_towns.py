@@ -1,3 +1,8 @@
+import os
+import subprocess
+import sys
+import zlib
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +12,9 @@ from kernels.raycast import Mesh
 
 SENSOR_HEIGHT = 1.8
 CLEARANCE = 1.2
-GROUND_TOLERANCE = 0.01  # half a step of the vertex raster, and slopes up to 6 % over it
+GROUND_TOLERANCE = 0.01  # half a step of the vertex raster, and slopes up to 11 % over it
+# After a change that is meant to change towns, the failing tests print the new ones.
+CHECKSUMS = {name: "" for name in towns.NAMES}
 
 
 def _cast(mesh, origins, directions, max_range=80.0):
@@ -17,9 +24,9 @@ def _cast(mesh, origins, directions, max_range=80.0):
     return hits.range.numpy().reshape(len(origins), len(directions))
 
 
-@pytest.fixture(scope="module")
-def town():
-    return towns.build("town01")
+@pytest.fixture(scope="module", params=towns.NAMES)
+def town(request):
+    return towns.build(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -33,17 +40,49 @@ def sensors(town):
     return town.waypoints[:: len(town.waypoints) // 40] + np.float32([0, 0, SENSOR_HEIGHT])
 
 
-def test_same_seed_same_arrays(town):
-    again = towns.build("town01", 0)
-    for field in ("vertices", "triangles", "waypoints", "headings", "parking", "walks"):
-        np.testing.assert_array_equal(getattr(again, field), getattr(town, field))
+@pytest.fixture(scope="session")
+def waypoints_of():
+    """Numbers of waypoints by town, filled as towns are built."""
+    return {}
 
 
-def test_another_seed_is_another_town(town):
-    other = towns.build("town01", 1)
+def _checksum(town):
+    """The bytes of all arrays in one number."""
+    arrays = town.vertices, town.triangles, town.waypoints, town.headings, town.parking, town.walks
+    return zlib.crc32(b"".join(a.tobytes() for a in arrays))
+
+
+def test_seed_0_is_the_same_town_everywhere(town):
+    assert f"{_checksum(town):08x}" == CHECKSUMS[town.name]
+
+
+def test_seed_0_is_the_same_town_on_a_processor_without_wide_registers():
+    found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
+    if not found:
+        pytest.skip("numpy has only its baseline here")
+    environment = os.environ | {"NPY_DISABLE_CPU_FEATURES": " ".join(found)}
+    code = (
+        "import zlib; from ilnet import towns; t = towns.build('town10');"
+        "arrays = t.vertices, t.triangles, t.waypoints, t.headings, t.parking, t.walks;"
+        "print(f'{zlib.crc32(b\"\".join(a.tobytes() for a in arrays)):08x}')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == CHECKSUMS["town10"], done.stderr
+
+
+def test_waypoints_are_as_many_as_in_the_paper(town, waypoints_of):
+    waypoints_of[town.name] = len(town.waypoints)
+    if len(waypoints_of) == len(towns.NAMES):
+        assert sum(waypoints_of[name] for name in towns.TRAIN) == 22_244
+        assert sum(waypoints_of[name] for name in towns.TEST) == 2_847
+
+
+def test_another_seed_is_another_town():
+    first, other = towns.build("town07"), towns.build("town07", 1)
     assert other.seed == 1
-    assert other.vertices.shape != town.vertices.shape
-    nearest = np.linalg.norm(other.waypoints[::20, None, :2] - town.waypoints[None, ::2, :2], axis=-1).min(1)
+    assert other.vertices.shape != first.vertices.shape
+    assert len(other.waypoints) <= len(first.waypoints)
+    nearest = np.linalg.norm(other.waypoints[::20, None, :2] - first.waypoints[None, ::2, :2], axis=-1).min(1)
     assert np.median(nearest) > 4
 
 
@@ -65,7 +104,7 @@ def test_triangles_have_area(town):
     a, b, c = (town.vertices[town.triangles[:, k]].astype(np.float64) for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     assert area.min() > 1e-7
-    assert 250_000 < len(area) < 750_000
+    assert 300_000 < len(area) < 2_000_000
 
 
 def test_waypoints_follow_their_lane(town):
@@ -78,7 +117,7 @@ def test_waypoints_follow_their_lane(town):
     turn = np.angle(np.exp(1j * (ahead - town.headings[:-1][in_lane])))
     assert np.abs(turn).max() < 0.2
     slope = np.abs(step[in_lane, 2]) / length[in_lane]
-    assert slope.max() < 0.08
+    assert slope.max() < 0.13
 
 
 def test_road_lies_under_every_waypoint(town, mesh):
@@ -108,7 +147,7 @@ def test_scans_look_like_streets(mesh, sensors):
         np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     )
     ranges = _cast(mesh, sensors, np.stack(way, axis=-1).reshape(-1, 3)).reshape(-1, 32, 1024)
-    assert 0.7 < (ranges > 0).mean() < 0.9
+    assert 0.55 < (ranges > 0).mean() < 0.96  # from open fields to streets between tall fronts
     assert (np.abs(np.diff(ranges)) > 0.5).mean() > 0.04
 
 
@@ -120,7 +159,7 @@ def test_traffic_is_drawn_anew_for_each_seed(town, sensors):
 
 
 def test_traffic_stands_on_the_ground_and_clear_of_the_sensor(town, mesh, sensors):
-    sizes = []
+    sizes, above = [], []
     for number, sensor in enumerate(sensors):
         vertices, triangles = towns.traffic(town, sensor, number)
         assert vertices.dtype == np.float32
@@ -131,11 +170,12 @@ def test_traffic_stands_on_the_ground_and_clear_of_the_sensor(town, mesh, sensor
         sizes.append(len(triangles))
         corners = vertices[triangles] - sensor
         assert np.linalg.norm(corners[..., :2], axis=-1).min() > CLEARANCE
-        assert np.linalg.norm(corners[..., :2], axis=-1).max() < 85 + 6
+        assert np.linalg.norm(corners[..., :2], axis=-1).max() < 85 + 8
         up = _cast(mesh, vertices[::97] + np.float32([0, 0, 0.3]), np.float32([[0, 0, -1]]), 5.0)
-        assert (up > 0).mean() > 0.99
-        lowest = up[up > 0].min()
-        assert lowest > 0.01  # no wheel sinks far into the road
+        above.append(up)
+    above = np.concatenate(above)
+    assert (above > 0).mean() > 0.99
+    assert (above < 0.1).mean() < 0.02  # nothing sinks into the road
     assert 5_000 < np.median(sizes) < 60_000
     assert np.ptp(sizes) > 0.5 * np.median(sizes)
 
@@ -165,7 +205,7 @@ def test_traffic_does_not_overlap():
         first = np.concatenate([[0], np.nonzero(starts[order][1:] > ends[:-1])[0] + 1])
         length = np.append(ends[first[1:] - 1], ends[-1]) - starts[order][first]
         assert len(length) > 5
-        assert length.max() < 8.9  # a lorry
+        assert length.max() < 11.7  # a bus
 
 
 def test_no_traffic_where_there_are_no_lanes(town):

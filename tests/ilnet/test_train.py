@@ -1,5 +1,11 @@
 import csv
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,8 +19,9 @@ def quick(monkeypatch, yard, quiet_street):
     """Training in the yard, with a network and batches of a size for tests."""
     street = quiet_street(yard, [[3, 0, 0]])
     monkeypatch.setattr(train.data, "street", lambda *args: street)
+    monkeypatch.setattr(train, "HELD_OUT", {"town01": 1})
     monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
-    size = train.Preset(blocks=1, steps=4, rate=1e-3, crops=2, columns=32, queries=64)
+    size = train.Preset(blocks=1, steps=4, crops=2, columns=32, queries=64, towns=("town01",))
     monkeypatch.setitem(train.PRESETS, "tiny", size)
     return lambda out, **options: train.train("iln-prior", "tiny", out, features=16, heads=4, **options)
 
@@ -77,7 +84,7 @@ def test_training_lowers_the_loss(yard, quiet_street):
     model = models.create("iln", features=16, blocks=1, heads=4, dropout=0.0)
     street = quiet_street(yard, [[3, 0, 0]])
     batch = next(iter(data.ContinuousRays([street], preset("paper-16x1024"), 4, 64, 256, seed=0)))
-    training = train.Training(model, [], 1e-3, {})
+    training = train.Training(model, [], 1e-3)
     training.log = lambda *args, **kwargs: None
     optimizer = torch.optim.Adam(model.parameters(), 3e-3)
     losses = []
@@ -92,14 +99,14 @@ def test_training_lowers_the_loss(yard, quiet_street):
 
 def test_the_loss_is_in_units_of_the_normalised_range(yard):
     model = models.create("iln", features=16, blocks=1, heads=4).eval()
-    training = train.Training(model, [], 1e-3, {})
+    training = train.Training(model, [], 1e-3)
     training.log = lambda *args, **kwargs: None
-    batch = data.Batch(torch.full((1, 4, 8), 20.0), torch.rand(1, 5, 2) * 3, torch.full((1, 5), 70.0))
+    batch = data.Batch(torch.full((1, 4, 8), 20.0), torch.rand(1, 5, 2) * 3, torch.full((1, 5), 70.0), False)
     assert training.training_step(batch, 0).item() == pytest.approx(50 * 2 / 100)
 
 
 def test_unknown_names_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="unknown preset 'huge'; known are tiny"):
+    with pytest.raises(ValueError, match="unknown preset 'huge'; known are paper, laptop, small, tiny"):
         train.train("iln", "huge", tmp_path)
     with pytest.raises(ValueError, match="'bilinear' cannot be trained"):
         train.train("bilinear", "tiny", tmp_path)
@@ -113,3 +120,58 @@ def test_the_head_of_a_network_with_a_prior_gets_a_gradient(yard):
     queries = torch.rand(1, 500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([15.0, 1024.0])
     model(image, queries).sum().backward()
     assert model.head[1].weight.grad.abs().max() > 0
+
+
+def test_two_processes_share_a_batch_and_agree_with_one(tmp_path):
+    """The same gradients in both, those of one process, and the same figures over all held-out scans."""
+    script = Path(__file__).with_name("train_in_yard.py")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1"}
+    launcher = ["-m", "torch.distributed.run", "--nproc-per-node=2", "--master-port=0", "--standalone"]
+    for name, prefix in (("one", []), ("two", launcher)):
+        (tmp_path / name).mkdir()
+        command = [sys.executable, *prefix, str(script), str(tmp_path / name)]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr[-3000:]
+    alone = torch.load(tmp_path / "one" / "rank-alone.pt")
+    for rank in (0, 1):
+        shared = torch.load(tmp_path / "two" / f"rank-{rank}.pt")
+        assert len(shared["gradients"]) == len(alone["gradients"]) == 2
+        for ours, expected in zip(shared["gradients"], alone["gradients"], strict=True):
+            for name, gradient in expected.items():
+                torch.testing.assert_close(
+                    ours[name], gradient, rtol=1e-3, atol=1e-6, msg=lambda m, n=name: f"{n}: {m}"
+                )
+        assert shared["figures"] == pytest.approx(alone["figures"], abs=2e-4)
+    assert alone["gradients"][0]["model.head.1.weight"].abs().max() > 0
+
+
+def test_a_loss_that_is_not_a_number_stops_and_keeps_the_batch(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(data.ContinuousRays, "_draw", spoilt(data.ContinuousRays._draw, 2))
+    with pytest.raises(ValueError, match=r"the loss of step 2 is nan.*step-2.pt"):
+        quick(tmp_path)
+    kept = torch.load(tmp_path / "iln-prior" / "step-2.pt")
+    assert kept["batch"]["ranges"].isnan().any()
+    assert "head.1.weight" in kept["model"]
+
+
+def spoilt(draw, bad):
+    def drawn(self, number):
+        batch = draw(self, number)
+        return batch._replace(ranges=batch.ranges * torch.nan) if number == bad else batch
+
+    return drawn
+
+
+def test_stored_images_are_learned_from(tmp_path, quick, monkeypatch):
+    sensors = [preset("paper-16x1024"), preset("paper-128x2048")]
+    sizes = {"16x1024": sensors[0], "128x2048": sensors[1]}
+    archive = data.Archive.create(tmp_path / "data", 2, sizes, {"towns": ["nowhere"]})
+    flat = {size: np.full((2, *sensor.shape), 5000, np.uint16) for size, sensor in sizes.items()}
+    archive.write(0, flat, np.zeros(2, int), np.zeros(2, int), np.zeros((2, 4, 4)))
+    monkeypatch.setitem(train.PRESETS, "tiny", dataclasses.replace(train.PRESETS["tiny"], crops=2, columns=1024))
+    figures = quick(tmp_path / "out", archive=tmp_path / "data")
+    assert set(figures) == {f"val/{name}" for name in metrics.FIGURES}
+    with pytest.raises(ValueError, match=r"preset paper learns from stored images.*--data DIR"):
+        train.train("iln", "paper", tmp_path)
+    with pytest.raises(FileNotFoundError, match="no such folder"):
+        quick(tmp_path / "out2", archive=tmp_path / "nothing")
