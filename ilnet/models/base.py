@@ -22,7 +22,7 @@ _TILE = {"cpu": 4096, "cuda": 65536}
 class Model(nn.Module):
     """A function r̂ = f(I, q) of a range image and query directions (paper, Eq. 1).
 
-    A subclass brings `decode`, and `encode` where it extracts features.
+    A subclass brings `decode`, `encode` where it extracts features, and `check_sensors` where it cannot predict any.
     """
 
     norm_range = 0.0
@@ -30,6 +30,9 @@ class Model(nn.Module):
 
     backend = "warp"
     """Of the ops: "warp", or "torch" for their plain twins (`kernels.reference`)."""
+
+    def check_sensors(self, source: Sensor, target: Sensor) -> None:
+        """Raises a ValueError where the model cannot predict what `target` would measure from scans of `source`."""
 
     def encode(self, image: torch.Tensor, wrap: bool) -> Any:
         """Computes once per image what all queries share; the image itself where there is nothing to extract.
@@ -117,7 +120,7 @@ class Upsampler:
         device: Where the scans and the model are.
 
     Raises:
-        ValueError: If the precision is unknown.
+        ValueError: If the precision is unknown, or the model cannot predict that sensor.
     """
 
     def __init__(
@@ -130,6 +133,7 @@ class Upsampler:
     ):
         if precision not in PRECISIONS:
             raise ValueError(f"precision is {precision!r}; it should be one of {', '.join(PRECISIONS)}")
+        model.check_sensors(source, target)
         self.model, self.source, self.target = model, source, target
         self.device = torch.device(device)
         self._half = precision == "bfloat16"
