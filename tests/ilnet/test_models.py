@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,6 +59,9 @@ def test_lidar_sr_predicts_its_own_size_and_refuses_others(yard):
     # Each query of the grid gets the pixel of its own, the seam included.
     assert torch.equal(dense, model.encode(scan.filled().unsqueeze(0), True)[0])
     assert len(dense.unique()) > 1000
+    falling = replace(source, elevations=source.elevations[::-1].copy())
+    turned = model.ranges(Scan(scan.ranges.flip(0), falling), falling.resize(32, 64))
+    torch.testing.assert_close(turned, dense.flip(0), rtol=0, atol=METRES)
     assert model.upsample(scan, target).sensor == target
     for other in (source.resize(16, 64), source.resize(32, 128)):
         with pytest.raises(ValueError, match="lidar-sr at 4x2 makes 32x64 rays of this scan, not"):
@@ -190,6 +194,25 @@ def test_upsample_to_any_sensor(name, yard):
         assert dense.ranges.any()
         assert ((dense.ranges == 0) | (dense.ranges >= target.min_range)).all()
         assert dense.ranges.max() <= target.max_range
+
+
+@pytest.mark.parametrize("flips", [(0,), (1,), (0, 1)])
+def test_networks_see_every_sensor_upright(flips, yard):
+    """Ouster and Velodyne store the highest beam first; networks were trained with the lowest first."""
+    model, source, target = small("bilinear"), preset("paper-16x1024"), preset("paper-64x1024")
+    scan = simulate(yard, source, pose((0.0, 0.0, 1.8)))
+
+    def flip(sensor):
+        elevations, azimuths = (
+            table[::-1] if axis in flips else table for axis, table in enumerate((sensor.elevations, sensor.azimuths))
+        )
+        return replace(sensor, elevations=elevations.copy(), azimuths=azimuths.copy())
+
+    expected = model.upsample(scan, target)
+    turned = model.upsample(Scan(scan.ranges.flip(flips), flip(source)), flip(target))
+    torch.testing.assert_close(turned.ranges.flip(flips), expected.ranges, rtol=0, atol=METRES)
+    upright = model.upsample(Scan(scan.ranges.flip(flips), flip(source)), target)
+    torch.testing.assert_close(upright.ranges, expected.ranges, rtol=0, atol=METRES)
 
 
 def test_upsample_does_not_depend_on_the_chunk(yard, monkeypatch):
