@@ -73,6 +73,8 @@ class LiDARSR(Model):
         self.merge = nn.ModuleList(_Block(*widths) for widths in pairwise(_WIDTHS[::-1]))
         self.last = nn.Conv2d(_WIDTHS[0], 1, 1)
         self.dropout = nn.Dropout2d(dropout)
+        # A sixth less time on a CPU.
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def check_sensors(self, source: Sensor, target: Sensor) -> None:
         """Refuses all but one target size, and rays that are not where the network takes them to be.
