@@ -1,8 +1,10 @@
+import sys
+
 import numpy as np
 import pytest
 import torch
 
-from ilnet import data, towns
+from ilnet import cli, data, towns
 from kernels import Mesh
 
 
@@ -46,3 +48,19 @@ def quiet_street():
         return data.Street(town, mesh)
 
     return make
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capsys):
+    """Runs a command line in an empty folder and in this process: starting another takes seconds each time."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GOMP_SPINCOUNT", "3000")
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["ilnet", *map(str, arguments)])
+        with pytest.raises(SystemExit) as exit:
+            cli.main()
+        out, err = capsys.readouterr()
+        return exit.value.code or 0, out, err.splitlines()
+
+    return run

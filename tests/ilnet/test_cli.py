@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from ilnet import cli
+from ilnet import metrics, models, scan
 
 METHODS = {"nearest", "bilinear", "bilinear-inverse", "iln", "iln-prior"}
 
@@ -91,7 +91,7 @@ def test_demo_of_a_scan_is_judged_against_its_own_rows(tmp_path, scan_file):
 EVALUATED = {"model", "size", "scans", "mae", "iou", "precision", "recall", "f1", "floating", "edge_mae"}
 
 
-def test_evaluate_measures_models_at_positions_in_a_mesh(tmp_path, mesh_file):
+def test_evaluate_measures_models_at_positions_in_a_mesh(command, tmp_path, mesh_file):
     (tmp_path / "at.json").write_text(json.dumps({"mesh": "yard.ply", "positions": [[0, 0, 1.8], [3, 3, 1.8]]}))
     scene = ("evaluate", "--scene", mesh_file, "--at", "at.json", "--size", "32x512", "--json")
     done = ilnet(*scene, "--model", "nearest", cwd=tmp_path)
@@ -100,31 +100,32 @@ def test_evaluate_measures_models_at_positions_in_a_mesh(tmp_path, mesh_file):
     assert set(nearest) == EVALUATED
     assert (nearest["model"], nearest["size"], nearest["scans"]) == ("nearest", "32x512", 2)
     assert "2/2" in done.stderr
-    done = ilnet(*scene, "--model", "nearest", "--model", "bilinear-inverse", "--scans", 1, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    first, inverse = json.loads(done.stdout)
+    _, out, _ = command(*scene, "--model", "nearest", "--model", "bilinear-inverse", "--scans", 1)
+    first, inverse = json.loads(out)
     assert first["scans"] == 1
     assert first["mae"] != nearest["mae"]
     assert inverse["iou"] > first["iou"]  # the ground is a plane
     assert inverse["floating"] > first["floating"]
 
 
-def test_evaluate_of_a_scan_says_what_demo_says(tmp_path, scan_file):
-    done = ilnet("evaluate", "--model", "bilinear", "--scan", scan_file, "--rows", 8, "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    result = json.loads(done.stdout)
+def test_evaluate_of_a_scan_judges_at_its_own_size(command, scan_file):
+    code, out, _ = command("evaluate", "--model", "bilinear", "--scan", scan_file, "--rows", 8, "--json")
+    result = json.loads(out)
+    assert code == 0
     assert set(result) == EVALUATED
     assert (result["size"], result["scans"]) == ("32x256", 1)
-    demo = json.loads(ilnet("demo", "--scan", scan_file, "--rows", 8, "--json", cwd=tmp_path).stdout)
-    for name in EVALUATED - {"model", "size", "scans"}:
-        assert result[name] == pytest.approx(demo["methods"]["bilinear"][name], rel=1e-6)
+    truth = scan.read(scan_file)
+    figures = metrics.compare(models.load("bilinear").ranges(truth.decimate(8), truth.sensor), truth)
+    assert {name: result[name] for name in EVALUATED & set(figures)} == pytest.approx(
+        {name: figures[name] for name in EVALUATED & set(figures)}, rel=1e-4
+    )
 
 
-def test_evaluate_in_a_town_prints_a_table(tmp_path):
-    arguments = ("--model", "iln-prior", "--model", "nearest", "--scene", "town01", "--size", "32x512", "--scans", 2)
-    done = ilnet("evaluate", *arguments, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    rows = {line.split()[0]: [float(word) for word in line.split()[1:]] for line in done.stdout.splitlines()[-2:]}
+def test_evaluate_in_a_town_prints_a_table(command):
+    methods = ("--model", "iln-prior", "--model", "nearest")
+    code, out, _ = command("evaluate", *methods, "--scene", "town01", "--size", "32x512", "--scans", 2)
+    assert code == 0
+    rows = {line.split()[0]: [float(word) for word in line.split()[1:]] for line in out.splitlines()[-2:]}
     assert rows["iln-prior"][0] < rows["nearest"][0]
 
 
@@ -212,20 +213,12 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_one_line_and_exit_code_2(case, tmp_path, mesh_file, monkeypatch, capsys):
+def test_bad_input_is_one_line_and_exit_code_2(case, tmp_path, mesh_file, command):
     bad_files(tmp_path)
     (tmp_path / "cut.ply").write_bytes(mesh_file.read_bytes()[:2000])
     arguments, message = BAD[case]
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("GOMP_SPINCOUNT", "3000")
-    monkeypatch.setattr(sys, "argv", ["ilnet", *arguments])
-    # In this process: starting another takes seconds each time, and anything but an exit fails the test.
-    with pytest.raises(SystemExit) as exit:
-        cli.main()
-    printed = capsys.readouterr()
-    assert exit.value.code == 2
-    assert printed.out == ""
-    last = printed.err.splitlines()[-1]
+    code, out, [*_, last] = command(*arguments)
+    assert (code, out) == (2, "")
     assert last.startswith("error: ")
     assert message in last
 

@@ -1,12 +1,10 @@
 """The command `upsample`, in this process."""
 
-import sys
-
 import numpy as np
 import pytest
 import torch
 
-from ilnet import cli, models, scan
+from ilnet import models, scan
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
 from ilnet.simulate import pose, simulate
@@ -15,17 +13,10 @@ SENSOR = preset("paper-16x1024").resize(8, 128)
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("GOMP_SPINCOUNT", "3000")
-
+def run(command):
     def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["ilnet", "upsample", *map(str, arguments)])
-        with pytest.raises(SystemExit) as exit:
-            cli.main()
-        printed = capsys.readouterr()
-        errors = [line for line in printed.err.splitlines() if line.startswith("error: ")]
-        return exit.value.code or 0, printed.out, errors
+        code, out, lines = command("upsample", *arguments)
+        return code, out, [line for line in lines if line.startswith("error: ")]
 
     return run
 
