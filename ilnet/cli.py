@@ -155,6 +155,45 @@ def evaluate_(
     click.echo(_table({result["model"]: result for result in results}))
 
 
+@cli.command("upsample")
+@click.argument("source", metavar="IN", type=Path)
+@click.argument("out", metavar="OUT", type=Path)
+@click.option("--size", type=_Size(), help="Rays wanted over the same field of view.")
+@click.option("--sensor", metavar="NAME", help="Or the preset whose scan is wanted.")
+@click.option("--model", "name", default="iln-prior", show_default=True, metavar="NAME|FILE")
+@click.option(
+    "--from", "origin", metavar="NAME", help="Preset with the angles of IN, where its files do not name them."
+)
+@click.option("--format", "suffix", type=click.Choice(["npz", "ply", "pcd"]), help="In a folder OUT; npz unless told.")
+@click.pass_context
+def upsample_(
+    context: click.Context,
+    source: Path,
+    out: Path,
+    size: tuple[int, int] | None,
+    sensor: str | None,
+    name: str,
+    origin: str | None,
+    suffix: str | None,
+) -> None:
+    """Make a denser scan of the file IN, or of each file in the folder IN."""
+    if bool(size) == bool(sensor):
+        raise click.UsageError("give --size ROWSxCOLUMNS or --sensor NAME")
+    if suffix and not source.is_dir():
+        raise click.UsageError("--format goes with a folder; the suffix of OUT says the format of one file")
+    from ilnet import models, upsample
+    from ilnet.sensor import preset
+
+    target = size or preset(str(sensor))
+    written, failed = upsample.upsample(
+        source, out, models.load(name), target, preset(origin) if origin else None, f".{suffix or 'npz'}"
+    )
+    if written:
+        click.echo(f"{written} scan(s) written to {out}" + (f", {failed} could not be: see above" if failed else ""))
+    if failed:
+        context.exit(2)
+
+
 @cli.command()
 @click.option("--towns", metavar="NAMES", help="Towns, comma separated, with a seed as in town01:7; all unless told.")
 @click.option("--mesh", type=Path, metavar="FILE", help="Scan this mesh (metres, z up) instead of towns.")

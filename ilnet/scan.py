@@ -312,7 +312,10 @@ def _read_pcd(path: Path, sensor: Sensor | None) -> Scan:
 
 def _required(sensor: Sensor | None) -> Sensor:
     if sensor is None:
-        raise ValueError("it does not say its sensor: name one (--sensor os1-128, or sensor=preset('os1-128'))")
+        raise ValueError(
+            "it does not say its sensor: name one (--sensor os1-128, in upsample --from os1-128, "
+            "in Python sensor=preset('os1-128'))"
+        )
     return sensor
 
 
