@@ -127,7 +127,7 @@ def evaluate_(
         raise click.UsageError("--at, --size and --scans go with --scene; a scan is judged at its own size")
     if scene and (rows is not None or sensor is not None):
         raise click.UsageError("--rows and --sensor go with --scan FILE")
-    from ilnet import evaluate, models, towns
+    from ilnet import evaluate, meshes, models, towns
 
     loaded = {name: models.load(name) for name in names}
     output = evaluate.INPUT.resize(*(size or (128, 2048)))
@@ -143,7 +143,7 @@ def evaluate_(
             raise click.UsageError(f"--scene {scene} is neither a town ({', '.join(towns.NAMES)}) nor a mesh file")
         if at is None:
             raise click.UsageError("--scene MESH needs --at FILE, the positions of the sensor in the mesh")
-        positions = evaluate.read_positions(at)
+        positions = [tuple(position) for position in meshes.read_positions(at).tolist()]
         if scans and scans > len(positions):
             raise click.UsageError(f"--scans is {scans}, but {at} holds {len(positions)} positions")
         pairs = evaluate.mesh_pairs(mesh, positions[:scans], output)
