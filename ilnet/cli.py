@@ -310,6 +310,36 @@ def towns(names: tuple[str, ...], out: Path) -> None:
         click.echo(path)
 
 
+@cli.command()
+@click.argument(
+    "names", nargs=-1, type=click.Choice(["table", "convergence", "attention", "prior", "rays", "real", "all"])
+)
+@click.option("--preset", default="small", show_default=True, help="Of each training.")
+@click.option("--out", type=Path, default=Path("runs/experiments"), show_default=True, help="Folder for all there is.")
+@click.option("--scans", type=click.IntRange(min=1), default=20, show_default=True, help="From each test town.")
+@click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, help="Trainings behind each band.")
+@click.option("--data", type=Path, metavar="DIR", help="Stored images: for LiDAR-SR, and against continuous rays.")
+@click.option("--measured", type=Path, multiple=True, metavar="FILE", help="A measured scan; may be repeated.")
+def experiment(
+    names: tuple[str, ...],
+    preset: str,
+    out: Path,
+    scans: int,
+    seeds: int,
+    data: Path | None,
+    measured: tuple[Path, ...],
+) -> None:
+    """Run the paper's experiments and ours: CSV, figures, RESULTS.md. Goes on where it was interrupted."""
+    if not names:
+        raise click.UsageError("name some experiments, or all")
+    from ilnet import experiment as experiments
+
+    study = experiments.Study(preset, out, scans, seeds, data, measured)
+    for name in experiments.EXPERIMENTS if "all" in names else names:
+        experiments.EXPERIMENTS[name](study)
+        click.echo(experiments.results(study))
+
+
 def _table(methods: dict[str, dict[str, Any]]) -> str:
     columns = {
         "mae": "MAE [m]",
