@@ -25,7 +25,7 @@ Position = tuple[float, float, float]
 
 
 def town_pairs(name: str, count: int, output: Sensor) -> list[Pair]:
-    """Scans a town that no network was trained in, at evenly spread waypoints, each with its own traffic.
+    """Scans a town at evenly spread waypoints, each with its own traffic.
 
     Args:
         name: One of `towns.NAMES`.

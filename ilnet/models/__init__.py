@@ -4,12 +4,15 @@ import json
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
+from ilnet.models import authors
 from ilnet.models.base import PRECISIONS, Model, Upsampler, returns
 from ilnet.models.bilinear import Bilinear, Nearest
 from ilnet.models.iln import ILN
+from ilnet.models.lidar_sr import LiDARSR
 from ilnet.models.liif import LIIF
 
 __all__ = [
@@ -19,6 +22,7 @@ __all__ = [
     "PRECISIONS",
     "TRAINABLE",
     "Bilinear",
+    "LiDARSR",
     "Model",
     "Nearest",
     "Upsampler",
@@ -34,6 +38,7 @@ _MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
     "bilinear": (Bilinear, {}),
     "bilinear-inverse": (Bilinear, {"inverse": True}),
     "liif": (LIIF, {}),
+    "lidar-sr": (LiDARSR, {}),
     "iln": (ILN, {}),
     "iln-prior": (ILN, {"prior": "perspective"}),
 }
@@ -82,26 +87,52 @@ def load(name: str | Path) -> Model:
     """Loads a trained model, ready to predict.
 
     Args:
-        name: One of `NAMES`, for the weights that ship with the package, or a file that `save` wrote.
+        name: One of `NAMES`, for the weights that ship with the package, a `.safetensors` file that `save` wrote, or a
+            `.pth` checkpoint of the authors' ILN, LIIF or LiDAR-SR. Nothing in a file is ever executed.
 
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If it is neither a name nor a file of weights.
     """
-    if name in NAMES and name not in TRAINABLE:
+    if name in NAMES and _MODELS[str(name)][0] in (Nearest, Bilinear):
         return create(str(name)).eval()
     path = _SHIPPED / f"{name}.safetensors" if name in NAMES else Path(name)
     if name in NAMES and not path.is_file():
-        raise FileNotFoundError(f"no weights ship for {name}; train them: python -m ilnet train {name}")
+        remedy = f"train them: python -m ilnet train {name}" if name in TRAINABLE else "give the file of a checkpoint"
+        raise FileNotFoundError(f"no weights ship for {name}; {remedy}")
+    if path.suffix not in (".safetensors", ".pth"):
+        raise ValueError(
+            f"unknown model {str(name)!r}; known are {', '.join(NAMES)}, a .safetensors file, "
+            "or a .pth checkpoint of the paper's authors"
+        )
     if not path.is_file():
-        if path.suffix != ".safetensors":
-            raise ValueError(f"unknown model {str(name)!r}; known are {', '.join(NAMES)}, or a .safetensors file")
         raise FileNotFoundError(f"{path}: no such file of weights")
+    if path.suffix == ".pth":
+        kind, arguments, state = authors.read(path)
+    else:
+        kind, arguments, state = _read(path)
+    try:
+        model = create(kind, **arguments)
+        _fill(model, state)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{path}: not weights of {kind} with {arguments} ({error})") from error
+    return model.eval()
+
+
+def _fill(model: Model, state: dict[str, torch.Tensor]) -> None:
+    """Loads parameters; what does not fit is one line, where torch has one for each."""
+    shapes = [{key: getattr(value, "shape", None) for key, value in s.items()} for s in (model.state_dict(), state)]
+    wrong = [key for key in sorted(shapes[0].keys() | shapes[1].keys()) if shapes[0].get(key) != shapes[1].get(key)]
+    if wrong:
+        raise ValueError(f"{len(wrong)} parameters are missing, too many or of another shape, such as {wrong[0]}")
+    model.load_state_dict(state)
+
+
+def _read(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.Tensor]]:
+    """What `save` wrote: name, arguments and parameters."""
     try:
         with safe_open(path, "pt") as file:
             about = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
-        model = create(about["name"], **about["arguments"])
-        model.load_state_dict(load_file(path))
-    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        return about["name"], dict(about["arguments"]), load_file(path)
+    except (SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: not weights that `python -m ilnet train` wrote ({error})") from error
-    return model.eval()

@@ -1,7 +1,9 @@
 """What all models share: one call, and the path from a scan to a denser scan."""
 
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -22,7 +24,10 @@ _TILE = {"cpu": 4096, "cuda": 65536}
 class Model(nn.Module):
     """A function r̂ = f(I, q) of a range image and query directions (paper, Eq. 1).
 
-    A subclass brings `decode`, and `encode` where it extracts features.
+    Its networks were trained with the lowest beam in row 0 and azimuths that rise; `ranges` and `upsample` turn scans
+    that are stored another way.
+
+    A subclass brings `decode`, `encode` where it extracts features, and `check_sensors` where it cannot predict any.
     """
 
     norm_range = 0.0
@@ -30,6 +35,9 @@ class Model(nn.Module):
 
     backend = "warp"
     """Of the ops: "warp", or "torch" for their plain twins (`kernels.reference`)."""
+
+    def check_sensors(self, source: Sensor, target: Sensor) -> None:
+        """Raises a ValueError where the model cannot predict what `target` would measure from scans of `source`."""
 
     def encode(self, image: torch.Tensor, wrap: bool) -> Any:
         """Computes once per image what all queries share; the image itself where there is nothing to extract.
@@ -55,7 +63,8 @@ class Model(nn.Module):
         """Predicts the range along each queried direction.
 
         Args:
-            image: (B, H, W) float32 ranges in metres, no return filled with the sensor's `norm_range` (`Scan.filled`).
+            image: (B, H, W) float32 ranges in metres, no return filled with the sensor's `norm_range` (`Scan.filled`);
+                lowest beam first, azimuths rising.
             queries: (B, Q, 2) float32 pixel coordinates (row, column) in that image (`Sensor.locate`).
             wrap: Whether column W-1 meets column 0 (`Sensor.wrap`).
 
@@ -117,7 +126,7 @@ class Upsampler:
         device: Where the scans and the model are.
 
     Raises:
-        ValueError: If the precision is unknown.
+        ValueError: If the precision is unknown, or the model cannot predict that sensor.
     """
 
     def __init__(
@@ -130,11 +139,16 @@ class Upsampler:
     ):
         if precision not in PRECISIONS:
             raise ValueError(f"precision is {precision!r}; it should be one of {', '.join(PRECISIONS)}")
+        model.check_sensors(source, target)
         self.model, self.source, self.target = model, source, target
         self.device = torch.device(device)
         self._half = precision == "bfloat16"
-        queries = source.grid_queries(target)
-        self._seen = source.contains(queries).to(self.device)
+        # The world is upright to a network as it was in training, whichever way a sensor stores its beams and columns.
+        tables = {-2: source.elevations, -1: source.azimuths}
+        self._flips = [axis for axis, table in tables.items() if table[0] > table[-1]]
+        upright = replace(source, elevations=np.sort(source.elevations), azimuths=np.sort(source.azimuths))
+        queries = upright.grid_queries(target)
+        self._seen = upright.contains(queries).to(self.device)
         self._queries = queries.view(1, -1, 2).to(self.device)
         self._warm = False
         self._graph: torch.cuda.CUDAGraph | None = None
@@ -150,7 +164,7 @@ class Upsampler:
             raise ValueError(f"the scan is of {scan.sensor!r}, but this upsampler was made for {self.source!r}")
         if scan.ranges.device.type != self.device.type:
             raise ValueError(f"the scan is on {scan.ranges.device}, but this upsampler was made for {self.device}")
-        image = scan.filled(self.model.norm_range).unsqueeze(0)
+        image = scan.filled(self.model.norm_range).flip(self._flips).unsqueeze(0)
         answer = self._replay(image) if self.device.type == "cuda" else self._answer(image)
         return answer.view(self.target.shape)
 

@@ -1,5 +1,5 @@
 import json
-import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -44,6 +44,51 @@ def test_liif_has_the_papers_size():
     assert sum(p.numel() for p in models.LIIF().parameters()) == 1_434_049
 
 
+@pytest.mark.parametrize(("rows", "columns", "parameters"), [(4, 1, 34_600_001), (8, 2, 34_637_057)])
+def test_lidar_sr_has_the_papers_size(rows, columns, parameters):
+    assert sum(p.numel() for p in models.LiDARSR(rows, columns).parameters()) == parameters
+
+
+def test_lidar_sr_predicts_its_own_size_and_refuses_others(yard):
+    torch.manual_seed(0)
+    model = models.create("lidar-sr", rows=4, columns=2).eval()
+    source = preset("paper-16x1024").resize(8, 32)
+    scan = simulate(yard, source, pose((0.0, 0.0, 1.8)))
+    target = source.resize(32, 64)
+    dense = model.ranges(scan, target)
+    # Each query of the grid gets the pixel of its own, the seam included.
+    assert torch.equal(dense, model.encode(scan.filled().unsqueeze(0), True)[0])
+    assert len(dense.unique()) > 1000
+    falling = replace(source, elevations=source.elevations[::-1].copy())
+    turned = model.ranges(Scan(scan.ranges.flip(0), falling), falling.resize(32, 64))
+    torch.testing.assert_close(turned, dense.flip(0), rtol=0, atol=METRES)
+    assert model.upsample(scan, target).sensor == target
+    for other in (source.resize(16, 64), source.resize(32, 128)):
+        with pytest.raises(ValueError, match="lidar-sr at 4x2 makes 32x64 rays of this scan, not"):
+            model.ranges(scan, other)
+    with pytest.raises(ValueError, match="looks elsewhere"):
+        model.upsample(scan, preset("os1-128").resize(32, 64))
+    with pytest.raises(ValueError, match="should be multiples of 16"):
+        model.ranges(scan.decimate(6), source.resize(24, 64))
+
+
+def test_lidar_sr_answers_a_part_of_the_circle():
+    sensor = Sensor(np.deg2rad(np.linspace(-15, 15, 8)), np.deg2rad(np.linspace(-45, 45, 16)))
+    model = models.create("lidar-sr", rows=2, columns=2).eval()
+    scan = Scan(torch.rand(sensor.shape) * 50 + 3, sensor)
+    dense = model.encode(scan.filled().unsqueeze(0), False)[0]
+    assert torch.equal(model.ranges(scan, sensor.resize(16, 32)), dense)
+
+
+def test_lidar_sr_learns_from_queries_like_the_others():
+    model = models.create("lidar-sr", rows=2, columns=1)
+    image, queries = torch.rand(2, 8, 16) * 50, torch.tensor([[[0.0, 0.0], [7.0, 15.0]], [[3.5, 2.0], [1.0, 7.0]]])
+    assert model(image, queries).shape == (2, 2)
+    torch.nn.init.ones_(model.last.bias)  # above the last ReLU's threshold
+    model(image, queries).sum().backward()
+    assert model.widen[0][0].weight.grad.abs().max() > 0
+
+
 def plain_iln(model, image, queries, wrap):
     """The network once more, formulated with torch's own layers and the reference ops."""
     scaled = image.clamp(max=100) / 50 - 1
@@ -85,34 +130,11 @@ def test_iln_matches_a_plain_formulation_with_gradients(prior, wrap, depth):
 # 2.5 mm of 100 m, after 34 convolutions in another order.
 NORMALISED = 5e-5
 
-# Their names for our parameters.
-AUTHORS = [
-    (r"encoder\.head\.0\.conv\.", "encoder.head."),
-    (r"encoder\.body\.(\d+)\.body\.0\.conv\.", r"encoder.blocks.\1.first."),
-    (r"encoder\.body\.(\d+)\.body\.2\.conv\.", r"encoder.blocks.\1.second."),
-    (r"encoder\.body\.\d+\.conv\.", "encoder.tail."),
-    (r"attention\.pos_embedding\.", "position."),
-    (r"attention\.transformer\.layers\.(\d+)\.0\.norm\.", r"blocks.\1.attention.norm."),
-    (r"attention\.transformer\.layers\.(\d+)\.0\.fn\.to_qkv\.", r"blocks.\1.attention.qkv."),
-    (r"attention\.transformer\.layers\.(\d+)\.0\.fn\.to_out\.0\.", r"blocks.\1.attention.out."),
-    (r"attention\.transformer\.layers\.(\d+)\.1\.norm\.", r"blocks.\1.feed_forward.0."),
-    (r"attention\.transformer\.layers\.(\d+)\.1\.fn\.net\.0\.", r"blocks.\1.feed_forward.1."),
-    (r"attention\.transformer\.layers\.(\d+)\.1\.fn\.net\.3\.", r"blocks.\1.feed_forward.4."),
-    (r"attention\.mlp_head\.", "head."),
-    (r"imnet\.layers\.", "value."),
-]
-
 
 @pytest.mark.parametrize(("name", "files"), [("iln", "iln_1d"), ("liif", "liif")])
 def test_gives_what_the_authors_network_gives(name, files, shared):
-    theirs = torch.load(shared / f"data/authors/{files}_random.pth", weights_only=True)["model"]["state_dict"]
-    state = {}
-    for key, value in theirs.items():
-        for pattern, ours in AUTHORS:
-            key = re.sub("^" + pattern, ours, key)
-        state[key] = value
-    model = models.create(name).eval()
-    model.load_state_dict(state)
+    model = models.load(shared / f"data/authors/{files}_random.pth")
+    assert type(model) is type(models.create(name))
     expected = np.load(shared / f"data/authors/{files}_expected.npz")
     image = torch.tensor(expected["range_image_m"]).unsqueeze(0)
     row, column = torch.tensor(expected["pixel"]).unbind(1)
@@ -172,6 +194,25 @@ def test_upsample_to_any_sensor(name, yard):
         assert dense.ranges.any()
         assert ((dense.ranges == 0) | (dense.ranges >= target.min_range)).all()
         assert dense.ranges.max() <= target.max_range
+
+
+@pytest.mark.parametrize("flips", [(0,), (1,), (0, 1)])
+def test_networks_see_every_sensor_upright(flips, yard):
+    """Ouster and Velodyne store the highest beam first; networks were trained with the lowest first."""
+    model, source, target = small("bilinear"), preset("paper-16x1024"), preset("paper-64x1024")
+    scan = simulate(yard, source, pose((0.0, 0.0, 1.8)))
+
+    def flip(sensor):
+        elevations, azimuths = (
+            table[::-1] if axis in flips else table for axis, table in enumerate((sensor.elevations, sensor.azimuths))
+        )
+        return replace(sensor, elevations=elevations.copy(), azimuths=azimuths.copy())
+
+    expected = model.upsample(scan, target)
+    turned = model.upsample(Scan(scan.ranges.flip(flips), flip(source)), flip(target))
+    torch.testing.assert_close(turned.ranges.flip(flips), expected.ranges, rtol=0, atol=METRES)
+    upright = model.upsample(Scan(scan.ranges.flip(flips), flip(source)), target)
+    torch.testing.assert_close(upright.ranges, expected.ranges, rtol=0, atol=METRES)
 
 
 def test_upsample_does_not_depend_on_the_chunk(yard, monkeypatch):
@@ -354,6 +395,14 @@ def test_bad_constructor_arguments_are_named(arguments, message):
 
 
 @pytest.mark.parametrize(
+    ("rows", "columns", "message"), [(3, 1, "rows is 3"), (4, 0, "columns is 0"), (1, 1, "nothing to predict")]
+)
+def test_lidar_sr_grows_by_powers_of_two(rows, columns, message):
+    with pytest.raises(ValueError, match=message):
+        models.create("lidar-sr", rows=rows, columns=columns)
+
+
+@pytest.mark.parametrize(
     ("image", "queries"), [((5, 6), (1, 7, 2)), ((1, 1, 5, 6), (1, 7, 2)), ((2, 5, 6), (7, 2)), ((2, 5, 6), (1, 7, 2))]
 )
 def test_bad_shapes_are_named(image, queries):
@@ -379,6 +428,8 @@ def test_bad_weights_are_refused(tmp_path):
         models.create("ilm")
     with pytest.raises(FileNotFoundError, match="no weights ship for liif"):
         models.load("liif")
+    with pytest.raises(FileNotFoundError, match="no weights ship for lidar-sr; give the file"):
+        models.load("lidar-sr")
     with pytest.raises(FileNotFoundError, match="no such file of weights"):
         models.load(tmp_path / "none.safetensors")
     (tmp_path / "text.safetensors").write_text("hello")

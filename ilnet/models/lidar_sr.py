@@ -1,0 +1,114 @@
+"""LiDAR-SR for range images: a U-Net that makes one denser image and no other (what the paper compares with)."""
+
+from itertools import pairwise
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from ilnet.models.base import Model
+from ilnet.sensor import Sensor
+
+__all__ = ["LiDARSR"]
+
+# Channels at the target size and after each halving of it.
+_WIDTHS = (64, 128, 256, 512, 1024)
+_HALVINGS = len(_WIDTHS) - 1
+
+
+class _Double(nn.Sequential):
+    """A transposed convolution that doubles rows, columns or both."""
+
+    def __init__(self, channels_in: int, channels_out: int, rows: bool = True, columns: bool = True):
+        stride = 1 + rows, 1 + columns
+        convolution = nn.ConvTranspose2d(channels_in, channels_out, 3, stride, 1, (int(rows), int(columns)))
+        super().__init__(convolution, nn.BatchNorm2d(channels_out), nn.ReLU())
+
+
+class _Block(nn.Sequential):
+    """Two convolutions, each with batch norm and ReLU."""
+
+    def __init__(self, channels_in: int, channels_out: int):
+        layers: list[nn.Module] = []
+        for channels in (channels_in, channels_out):
+            layers += [nn.Conv2d(channels, channels_out, 3, padding=1), nn.BatchNorm2d(channels_out), nn.ReLU()]
+        super().__init__(*layers)
+
+
+class LiDARSR(Model):
+    """r̂ = U(I) at all pixels of one denser image at once: what a network without queries does.
+
+    The image is doubled until it has the target's size, halved four times and doubled again, each time beside what had
+    that size before. A query is answered with the pixel nearest to it. Columns do not meet at the seam, as in the
+    authors' code: convolutions see zeros beyond the image.
+
+    Args:
+        rows: How many times the input's rows are predicted, a power of two.
+        columns: How many times its columns, a power of two.
+        dropout: Rate of whole channels while training.
+        norm_range: Metres that the network sees, and predicts, as 1; no return is filled with it.
+
+    Raises:
+        ValueError: If rows or columns is no power of two, or both are 1.
+
+    Source: T. Shan et al., "Simulation-based lidar super-resolution for ground vehicles", RAS 2020; sizes as in the
+        code of the paper's authors. 34.6 million parameters.
+    """
+
+    def __init__(self, rows: int = 8, columns: int = 2, dropout: float = 0.25, norm_range: float = 100.0):
+        for name, times in (("rows", rows), ("columns", columns)):
+            if times < 1 or times & (times - 1):
+                raise ValueError(f"{name} is {times}; it should be a power of two")
+        if rows == columns == 1:
+            raise ValueError("rows and columns are both 1: there is nothing to predict")
+        super().__init__()
+        self.rows, self.columns, self.norm_range = rows, columns, norm_range
+        doublings = range(max(rows, columns).bit_length() - 1)
+        self.widen = nn.Sequential(
+            *(_Double(_WIDTHS[0] if i else 1, _WIDTHS[0], rows > 1 << i, columns > 1 << i) for i in doublings),
+            _Block(_WIDTHS[0], _WIDTHS[0]),
+        )
+        self.down = nn.ModuleList(_Block(*widths) for widths in pairwise(_WIDTHS))
+        self.up = nn.ModuleList(_Double(*widths) for widths in pairwise(_WIDTHS[::-1]))
+        self.merge = nn.ModuleList(_Block(*widths) for widths in pairwise(_WIDTHS[::-1]))
+        self.last = nn.Conv2d(_WIDTHS[0], 1, 1)
+        self.dropout = nn.Dropout2d(dropout)
+
+    def check_sensors(self, source: Sensor, target: Sensor) -> None:
+        """Refuses all but one target size, and rays that are not where the network takes them to be.
+
+        Raises:
+            ValueError: If `target` has another size than the network makes of `source`, or looks elsewhere.
+        """
+        size = source.shape[0] * self.rows, source.shape[1] * self.columns
+        what = f"lidar-sr at {self.rows}x{self.columns} makes {size[0]}x{size[1]} rays of this scan"
+        if target.shape != size:
+            raise ValueError(f"{what}, not {target.shape[0]}x{target.shape[1]}: a network has one target size")
+        if any(count % (1 << _HALVINGS) for count in size):
+            raise ValueError(f"{what}, but both numbers should be multiples of {1 << _HALVINGS}")
+        away = (source.grid_queries(target) - source.grid_queries(source.resize(*size))).abs()
+        away[..., 1] = torch.minimum(away[..., 1], source.shape[1] - away[..., 1])
+        if away.max() > 0.5:
+            raise ValueError(f"{what}, evenly over its field of view; {target} looks elsewhere")
+
+    def encode(self, image: torch.Tensor, wrap: bool) -> torch.Tensor:
+        """Predicts the denser image (B, H rows, W columns) [m] of ranges (B, H, W) [m], which it sees in [0, 1]."""
+        x = self.widen((image.clamp(max=self.norm_range) / self.norm_range).unsqueeze(1))
+        before = []
+        for block in self.down:
+            before.append(x)
+            x = block(self.dropout(F.avg_pool2d(x, 2)))
+        for double, block in zip(self.up, self.merge, strict=True):
+            x = block(torch.cat((before.pop(), double(self.dropout(x))), 1))
+        return self.last(x).relu().squeeze(1).to(image.dtype) * self.norm_range
+
+    def decode(self, dense: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+        """Answers queries (B, Q, 2) with the nearest pixels (B, Q) [m] of the denser image."""
+        (height, width), (rows, columns) = image.shape[1:], dense.shape[1:]
+        # Outermost rows stay where they are, as do outermost columns where there is no seam.
+        row = queries[..., 0] * ((rows - 1) / (height - 1))
+        column = queries[..., 1] * (self.columns if wrap else (columns - 1) / (width - 1))
+        row = row.round().long().clamp(0, rows - 1)
+        column = column.round().long()
+        column = column.remainder(columns) if wrap else column.clamp(0, columns - 1)
+        return dense.flatten(1).gather(1, row * columns + column)
