@@ -29,7 +29,7 @@ def greenery(rng: np.random.Generator) -> Greens:
         "conifer": [plants.conifer(rng, rng.uniform(6, 11), 420) for _ in range(2)],
         "bush": [plants.bush(rng, rng.uniform(0.6, 1.1), 110) for _ in range(4)],
         "far": [
-            plants.tree(rng, rng.uniform(9, 14), rng.uniform(3.2, 4.5), 1.5, 420, (0.4, 0.75), twigs=1)
+            plants.tree(rng, rng.uniform(9, 14), rng.uniform(3.2, 4.5), 1.5, 560, (0.34, 0.6), twigs=1)
             for _ in range(3)
         ],
     }
@@ -222,12 +222,6 @@ def _power_line(site: Site, street: Street, rng: np.random.Generator) -> None:
                 site.put_at(furniture.wire(hooks[k], hooks[k + 1], rng.uniform(0.3, 0.8)), (0, 0, 0))
 
 
-def _in_sight(site: Site, xy: np.ndarray) -> np.ndarray:
-    """Whether points (N, 2) are within a LiDAR's reach of some street."""
-    road = np.concatenate([street.core[::5] for street in site.ground.streets])
-    return np.linalg.norm(xy[:, None] - road, axis=-1).min(1) < 85
-
-
 def plant_fields(site: Site, greens: dict[str, list[Part]], radius: float, rng: np.random.Generator) -> None:
     """Trees between the lots and a ragged treeline around the town at about `radius` metres."""
     turn = np.linspace(0, 2 * np.pi, 130, endpoint=False)
@@ -235,12 +229,12 @@ def plant_fields(site: Site, greens: dict[str, list[Part]], radius: float, rng: 
     ring = np.column_stack([np.cos(turn), np.sin(turn)])
     # a rounded square reaches into the corners of the ground
     ring *= (reach / np.maximum(np.abs(ring).max(1), 0.8))[:, None]
-    ring = ring[_in_sight(site, ring) & (rng.random(len(ring)) < 0.9)]
+    ring = ring[site.in_sight(ring) & (rng.random(len(ring)) < 0.9)]
     for at in ring:
         if site.free(at[None], 8.0):
             site.put(_pick(greens["far"], rng), at, rng.uniform(0, 6), rng.uniform(0.7, 1.2))
     spots = rng.uniform(-0.95 * radius, 0.95 * radius, (1600, 2))
-    spots = spots[(site.ground.edge(spots) > 6) & ~site.taken(spots) & _in_sight(site, spots)]
+    spots = spots[(site.ground.edge(spots) > 6) & ~site.taken(spots) & site.in_sight(spots)]
     around = 3 * np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
     for at in spots[:170]:
         if not site.taken(at + around).any():

@@ -272,14 +272,15 @@ def power_line(site: Site, street: Street, right: float, rng: np.random.Generato
 
 
 def fields(site: Site, greens: Greens, rng: np.random.Generator) -> None:
-    """Boundaries of fields away from the lanes: walls, hedges with trees, fences; bales on some."""
-    reach = site.ground.extent - 30.0
-    for _ in range(34):
-        middle, turn, length = rng.uniform(-reach, reach, 2), rng.uniform(0, np.pi), rng.uniform(40, 110)
+    """Boundaries of fields, all much alike in direction: walls, hedges with trees, fences; and bales."""
+    reach, grain = site.ground.extent - 30.0, rng.uniform(0, np.pi)
+    for _ in range(46):
+        middle, length = rng.uniform(-reach, reach, 2), rng.uniform(40, 110)
+        turn = grain + np.pi / 2 * int(rng.integers(0, 2)) + rng.normal(0, 0.08)
         way = np.array([np.cos(turn), np.sin(turn)])
         path = middle + np.linspace(-0.5, 0.5, max(2, round(length / 4)))[:, None] * length * way
         path = path[(np.abs(path) < reach).all(1)]
-        path = path[site.ground.edge(path) > 6]
+        path = path[(site.ground.edge(path) > 6) & ~site.taken(path) & site.in_sight(path)]
         if len(path) < 2:
             continue
         kind = rng.random()

@@ -80,6 +80,11 @@ class Site:
         i, j = np.clip(np.round(points).astype(int) + self.ground.extent, 0, len(self._taken) - 1).T
         return self._taken[i, j]
 
+    def in_sight(self, points: np.ndarray) -> np.ndarray:
+        """Whether points (N, 2) are within a LiDAR's reach of some street."""
+        road = np.concatenate([street.core[::5] for street in self.ground.streets])
+        return np.linalg.norm(points[:, None] - road, axis=-1).min(1) < 85
+
     def claim(self, points: np.ndarray) -> None:
         """Mark points (N, 2) as taken."""
         i, j = np.clip(np.round(points).astype(int) + self.ground.extent, 0, len(self._taken) - 1).T
