@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 
 from ilnet.towns import buildings, furniture, plants, structures
-from ilnet.towns.dressing import Greens
 from ilnet.towns.frontage import Lot
 from ilnet.towns.parts import Part, boxes, merge, place
+from ilnet.towns.plants import Greens
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Street, inside
 
@@ -26,10 +26,6 @@ __all__ = [
 ]
 
 
-def _pick(parts: list[Part], rng: np.random.Generator) -> Part:
-    return parts[int(rng.integers(0, len(parts)))]
-
-
 def _plot(site: Site, street: Street, share: float, side: int, setback: float, width: float, depth: float) -> Lot:
     """Returns a frame beside a street, its rectangle claimed."""
     lot = Lot.beside(street, street.tails[0] + share * (street.length - sum(street.tails)), side, setback)
@@ -40,7 +36,7 @@ def _plot(site: Site, street: Street, share: float, side: int, setback: float, w
 def _grown(site: Site, greens: Greens, kinds: tuple[str, ...], spots: np.ndarray, rng: np.random.Generator) -> None:
     """Plants at spots (N, 2) that are off the carriageways."""
     for at in spots[site.ground.edge(spots) > 1.6]:
-        site.put(_pick(greens[str(rng.choice(kinds))], rng), at, rng.uniform(0, 6), rng.uniform(0.8, 1.2))
+        site.put(greens.pick(rng, str(rng.choice(kinds))), at, rng.uniform(0, 6), rng.uniform(0.8, 1.2))
 
 
 def _enclose(

@@ -20,10 +20,10 @@ _PLACES = {
     "town01": 0.2,
     "town02": 0.03,
     "town03": 0.12,
-    "town04": 0.2,
-    "town05": 0.4,
+    "town04": 0.08,
+    "town05": 0.5,
     "town06": 0.55,
-    "town07": 0.3,
+    "town07": 0.5,
     "town10": 0.02,
 }
 _SENSOR = preset("paper-128x2048")
@@ -67,11 +67,12 @@ def draw(names: list[str], out: Path) -> list[Path]:
         panels.append((f"{name}: {len(town.triangles) / 1e6:.2f} M triangles", above, street))
         for view, picture in (("above", above), ("street", street)):
             files.append(out / f"{name}_{view}.jpg")
-            picture.save(files[-1], quality=82)
+            picture.save(files[-1], quality=78)
     files += [out / "range_images.png", out / "points.png", out / "towns.png"]
     height, width = _SENSOR.shape
     plot.range_images(scans, files[-3], f"One scan of {height} by {width} rays in each town")
     plot.point_clouds(scans, files[-2])
+    Image.open(files[-2]).convert("RGB").quantize(96).save(files[-2], optimize=True)
     _sheet(panels).save(files[-1], optimize=True)
     return files
 
