@@ -127,7 +127,7 @@ def evaluate_(
         raise click.UsageError("--at, --size and --scans go with --scene; a scan is judged at its own size")
     if scene and (rows is not None or sensor is not None):
         raise click.UsageError("--rows and --sensor go with --scan FILE")
-    from ilnet import evaluate, models, towns
+    from ilnet import evaluate, meshes, models, towns
 
     loaded = {name: models.load(name) for name in names}
     output = evaluate.INPUT.resize(*(size or (128, 2048)))
@@ -143,7 +143,7 @@ def evaluate_(
             raise click.UsageError(f"--scene {scene} is neither a town ({', '.join(towns.NAMES)}) nor a mesh file")
         if at is None:
             raise click.UsageError("--scene MESH needs --at FILE, the positions of the sensor in the mesh")
-        positions = evaluate.read_positions(at)
+        positions = [tuple(position) for position in meshes.read_positions(at).tolist()]
         if scans and scans > len(positions):
             raise click.UsageError(f"--scans is {scans}, but {at} holds {len(positions)} positions")
         pairs = evaluate.mesh_pairs(mesh, positions[:scans], output)
@@ -308,6 +308,36 @@ def towns(names: tuple[str, ...], out: Path) -> None:
 
     for path in pictures.draw(list(names or NAMES), out):
         click.echo(path)
+
+
+@cli.command()
+@click.argument(
+    "names", nargs=-1, type=click.Choice(["table", "convergence", "attention", "prior", "rays", "real", "all"])
+)
+@click.option("--preset", default="small", show_default=True, help="Of each training.")
+@click.option("--out", type=Path, default=Path("runs/experiments"), show_default=True, help="Folder for all there is.")
+@click.option("--scans", type=click.IntRange(min=1), default=20, show_default=True, help="From each test town.")
+@click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, help="Trainings behind each band.")
+@click.option("--data", type=Path, metavar="DIR", help="Stored images: for LiDAR-SR, and against continuous rays.")
+@click.option("--measured", type=Path, multiple=True, metavar="FILE", help="A measured scan; may be repeated.")
+def experiment(
+    names: tuple[str, ...],
+    preset: str,
+    out: Path,
+    scans: int,
+    seeds: int,
+    data: Path | None,
+    measured: tuple[Path, ...],
+) -> None:
+    """Run the paper's experiments and ours: CSV, figures, RESULTS.md. Goes on where it was interrupted."""
+    if not names:
+        raise click.UsageError("name some experiments, or all")
+    from ilnet import experiment as experiments
+
+    study = experiments.Study(preset, out, scans, seeds, data, measured)
+    for name in experiments.EXPERIMENTS if "all" in names else names:
+        experiments.EXPERIMENTS[name](study)
+        click.echo(experiments.results(study))
 
 
 def _table(methods: dict[str, dict[str, Any]]) -> str:

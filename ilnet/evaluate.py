@@ -1,6 +1,5 @@
 """Figures of any model in any scene: pairs of what it sees and what it should predict, and the means over them."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
 from kernels import Mesh
 
-__all__ = ["INPUT", "evaluate", "mesh_pairs", "read_positions", "scan_pair", "town_pairs"]
+__all__ = ["INPUT", "evaluate", "mesh_pairs", "scan_pair", "town_pairs"]
 
 # What the models see of a scene.
 INPUT = preset("paper-16x1024")
@@ -41,23 +40,6 @@ def town_pairs(name: str, count: int, output: Sensor) -> list[Pair]:
     """
     street = data.street(name, seed=0, device=simulate.best_device())
     return [(scan, truth) for scan, truth in data.held_out_scans(street, count, [INPUT, output])]
-
-
-def read_positions(path: Path) -> list[Position]:
-    """Reads `{"positions": [[x, y, z], ...]}`, positions of a sensor [m] in a mesh; other keys are ignored.
-
-    Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it holds anything else.
-    """
-    try:
-        content = json.loads(path.read_text())
-        positions = [(float(x), float(y), float(z)) for x, y, z in content["positions"]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f'{path}: should be {{"positions": [[x, y, z], ...]}} in metres ({error})') from error
-    if not positions:
-        raise ValueError(f"{path}: holds no position")
-    return positions
 
 
 def mesh_pairs(path: Path, positions: Sequence[Position], output: Sensor) -> list[Pair]:

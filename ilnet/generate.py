@@ -8,7 +8,6 @@ import bisect
 import contextlib
 import hashlib
 import itertools
-import json
 import math
 import multiprocessing
 import os
@@ -97,14 +96,7 @@ def mesh_place(file: Path, positions: Path) -> Places:
         OSError: If a file cannot be read.
         ValueError: If one is damaged, or there is no ground under a position.
     """
-    try:
-        at = torch.tensor(json.loads(positions.read_bytes())["positions"], dtype=torch.float64)
-        if at.ndim != 2 or at.shape[1] != 3 or not len(at) or not at.isfinite().all():
-            raise ValueError
-    except (ValueError, TypeError, KeyError):
-        raise ValueError(
-            f'{positions}: should be JSON like {{"positions": [[x, y, z], ...]}}, finite metres in the mesh'
-        ) from None
+    at = torch.from_numpy(meshes.read_positions(positions))
     vertices, triangles = meshes.read(file)
     down = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
     ground = Mesh(vertices, triangles).cast(at, down, _GROUND_WITHIN).range

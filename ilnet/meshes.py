@@ -4,6 +4,8 @@ VTK's readers write to stderr, return empty meshes, or crash the process when a 
 process of their own, `python -m ilnet.meshes FILE OUT.npz`, which may do all that.
 """
 
+import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -11,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["read"]
+__all__ = ["read", "read_positions"]
 
 
 def read(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
@@ -50,6 +52,35 @@ def read(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise ValueError(f"{path}: its triangles name vertices that are not there; the file is damaged")
     return vertices, triangles
+
+
+def read_positions(path: str | Path, height: float | None = None) -> np.ndarray:
+    """Reads where a sensor stands in a mesh, from JSON such as `{"positions": [[x, y, z], ...]}`.
+
+    Args:
+        path: The file.
+        height: Metres above the ground to move the positions to; the file then tells theirs as `sensor_height_m`.
+
+    Returns:
+        (N, 3) float64 metres, N > 0.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it holds anything else.
+    """
+    try:
+        content = json.loads(Path(path).read_bytes())
+        positions = np.array(content["positions"], dtype=np.float64)
+        lift = 0.0 if height is None else height - float(content["sensor_height_m"])
+        if positions.ndim != 2 or positions.shape[1] != 3 or len(positions) == 0:
+            raise ValueError("not a list of [x, y, z]")
+        if not np.isfinite(positions).all() or not math.isfinite(lift):
+            raise ValueError("NaN or infinite numbers")
+    except (ValueError, TypeError, KeyError) as error:
+        needed = '"positions": [[x, y, z], ...]' + ("" if height is None else ', "sensor_height_m": z')
+        problem = f"lacks {error}" if isinstance(error, KeyError) else error
+        raise ValueError(f"{path}: should be JSON like {{{needed}}}, metres in the mesh ({problem})") from None
+    return positions + np.array([0, 0, lift])
 
 
 def _convert(path: str, out: str) -> None:

@@ -9,7 +9,6 @@ it.
 Measured scans are not levelled: a tilted sensor sees tilted ground.
 """
 
-import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
@@ -227,7 +226,7 @@ def survey(
         entries += _simulated(name, "town", _in_town(data.street(name, device=device)), sensors)
     for path, positions in mesh_files:
         mesh = Mesh(*meshes.read(path), device)
-        poses = [simulate.pose(at) for at in _positions(positions)]
+        poses = [simulate.pose(tuple(at)) for at in meshes.read_positions(positions, data.SENSOR_HEIGHT)]
         entries += _simulated(path.stem, "mesh", [([mesh], pose) for pose in poses], sensors)
     return sorted(entries, key=lambda entry: [name for name, *_ in sensors].index(entry.sensor))
 
@@ -242,22 +241,6 @@ def _in_town(street: data.Street) -> list[_Place]:
         pose = street.pose(number)
         places.append((street.world(pose[:3, 3], number), pose))
     return places
-
-
-def _positions(path: Path) -> list[tuple[float, float, float]]:
-    """Returns the positions in a file, moved to `data.SENSOR_HEIGHT` above the ground."""
-    try:
-        content = json.loads(path.read_text())
-        lift = data.SENSOR_HEIGHT - float(content["sensor_height_m"])
-        positions = [(float(x), float(y), float(z) + lift) for x, y, z in content["positions"]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{path}: should be a JSON object with `positions`, a list of [x, y, z] in metres, and `sensor_height_m`: "
-            f"{error}"
-        ) from None
-    if not positions:
-        raise ValueError(f"{path}: its list of `positions` is empty; name at least one")
-    return positions
 
 
 def _simulated(

@@ -5,6 +5,7 @@ images stored on disk. Under `torchrun` several processes share each batch.
 """
 
 import os
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ import lightning
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from torch import nn
 from torch.utils.data import DataLoader
 
 from ilnet import data, metrics, models, simulate, towns
@@ -21,6 +23,8 @@ from ilnet.scan import Scan
 from ilnet.sensor import preset
 
 __all__ = ["PRESETS", "Preset", "Training", "train"]
+
+Pair = tuple[Scan, Scan]
 
 INPUT = "paper-16x1024"
 OUTPUT = "paper-64x1024"
@@ -30,8 +34,10 @@ INPUT_SIZE, TARGET_SIZE = "16x1024", "128x2048"
 HELD_OUT = {"town01": 1, "town03": 1, "town05": 1}
 HELD_OUT_SCANS = 4
 PRECISION: Any = "bf16-mixed"
+# Validations in a training, and the fewest and most steps between them.
+VALIDATIONS = 20
+VALIDATE_EVERY = 50, 2000
 # Steps.
-VALIDATE_EVERY = 200
 CHECKPOINT_EVERY = 100
 
 
@@ -85,6 +91,7 @@ class Training(lightning.LightningModule):
     Args:
         model: What is trained; it has a `norm_range`.
         held_out: Pairs of an input scan and the scan to be predicted.
+        probe: More such pairs, whose figures are logged and decide nothing.
         rate: Highest learning rate.
         halve_after: Steps after which the rate is halved; where empty, it follows one cycle.
         run: What tells this run from others; kept in its checkpoints.
@@ -93,14 +100,17 @@ class Training(lightning.LightningModule):
     def __init__(
         self,
         model: models.ILN | models.LIIF,
-        held_out: list[list[Scan]],
+        held_out: Sequence[Pair],
         rate: float,
         halve_after: Sequence[int] = (),
         run: dict[str, Any] | None = None,
+        probe: Sequence[Pair] = (),
     ):
         super().__init__()
-        self.model, self.held_out, self.rate, self.halve_after, self.run = model, held_out, rate, halve_after, run
-        self.figures = metrics.ScanMetrics()
+        self.model, self.rate, self.halve_after, self.run = model, rate, halve_after, run
+        self.pairs = {"val": held_out, "test": probe}
+        self.figures = nn.ModuleDict({kind: metrics.ScanMetrics() for kind, pairs in self.pairs.items() if pairs})
+        self.begun = time.monotonic()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Lets `train` refuse to go on with a run of another kind."""
@@ -117,16 +127,19 @@ class Training(lightning.LightningModule):
         self.log("loss", loss, prog_bar=True)
         return loss
 
-    def validation_step(self, number: int, index: int) -> None:
-        """Measures one held-out scan."""
-        scan, truth = self.held_out[number]
-        self.figures.update(self.model.ranges(scan, truth.sensor).float(), truth)
+    def validation_step(self, place: tuple[str, int], index: int) -> None:
+        """Measures one scan: of which kind, and its number."""
+        kind, number = place
+        scan, truth = self.pairs[kind][number]
+        self.figures[kind].update(self.model.ranges(scan, truth.sensor).float(), truth)  # type: ignore[operator]
 
     def on_validation_epoch_end(self) -> None:
         """Logs the means over all scans of all processes."""
-        for name, value in self.figures.compute().items():
-            self.log(f"val/{name}", value.float(), prog_bar=name in ("mae", "iou"))
-        self.figures.reset()
+        self.log("seconds", time.monotonic() - self.begun)
+        for kind, figures in self.figures.items():
+            for name, value in figures.compute().items():  # type: ignore[operator]
+                self.log(f"{kind}/{name}", value.float(), prog_bar=kind == "val" and name in ("mae", "iou"))
+            figures.reset()  # type: ignore[operator]
 
     def configure_optimizers(self) -> Any:
         """Adam; the rate warms up and decays to 0, or is halved now and then."""
@@ -147,6 +160,7 @@ def train(
     steps: int | None = None,
     seed: int = 0,
     archive: Path | None = None,
+    probe: Sequence[Pair] = (),
     **arguments: Any,
 ) -> dict[str, float]:
     """Trains a model and writes its weights and figures; goes on where an interrupted run in `out` stopped.
@@ -161,6 +175,8 @@ def train(
         steps: Overrides the preset's.
         seed: Of the initial weights and the rays, 0 or more.
         archive: Stored images to learn from instead of continuous rays; see `data.open_archive`.
+        probe: Pairs of an input scan and the scan to be predicted, whose figures are logged as `test/...` and decide
+            nothing.
         **arguments: Override the model's.
 
     Returns:
@@ -195,15 +211,16 @@ def train(
     model = models.create(name, **arguments)
     assert isinstance(model, models.ILN | models.LIIF)
     samples = _samples(size, stored, seed, start, (number, processes), device)
-    held_out = [
-        pair
+    held_out: list[Pair] = [
+        (pair[0], pair[1])
         for town, held_out_seed in HELD_OUT.items()
         for pair in data.held_out_scans(
             data.street(town, held_out_seed, device), HELD_OUT_SCANS, [preset(INPUT), preset(OUTPUT)]
         )
     ]
-    training = Training(model, held_out, size.rate, [epoch * per_epoch for epoch in size.halve_after], run)
-    scans: DataLoader[int] = DataLoader(range(number, len(held_out), processes), batch_size=None)  # type: ignore[arg-type]
+    training = Training(model, held_out, size.rate, [epoch * per_epoch for epoch in size.halve_after], run, probe)
+    places = [(kind, place) for kind, pairs in training.pairs.items() for place in range(number, len(pairs), processes)]
+    scans: DataLoader[tuple[str, int]] = DataLoader(places, batch_size=None)  # type: ignore[arg-type]
     best = ModelCheckpoint(folder, "best", monitor="val/iou", mode="max", enable_version_counter=False)
     last = ModelCheckpoint(folder, "last", every_n_train_steps=CHECKPOINT_EVERY, enable_version_counter=False)
     trainer = lightning.Trainer(
@@ -212,7 +229,7 @@ def train(
         accelerator=device.type,
         **_processes(processes),
         use_distributed_sampler=False,
-        val_check_interval=min(VALIDATE_EVERY, steps),
+        val_check_interval=min(max(VALIDATE_EVERY[0], steps // VALIDATIONS), VALIDATE_EVERY[1], steps),
         num_sanity_val_steps=0,
         log_every_n_steps=10,
         default_root_dir=folder,
@@ -263,8 +280,9 @@ def _processes(number: int) -> dict[str, Any]:
     return {"strategy": "ddp", "devices": here, "num_nodes": number // here}
 
 
-def _validate(trainer: lightning.Trainer, training: Training, scans: DataLoader[int]) -> dict[str, float]:
-    return {key: round(value, 4) for key, value in trainer.validate(training, scans, verbose=False)[0].items()}
+def _validate(trainer: lightning.Trainer, training: Training, scans: DataLoader[tuple[str, int]]) -> dict[str, float]:
+    found = trainer.validate(training, scans, verbose=False)[0]
+    return {key: round(value, 4) for key, value in found.items() if key != "seconds"}
 
 
 def _steps_done(checkpoint: Path, run: dict[str, Any]) -> int:

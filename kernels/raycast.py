@@ -16,6 +16,8 @@ __all__ = ["Hits", "Mesh"]
 
 # Metres. A nearer hit is reported at this range, since 0 means none.
 _LEAST_RANGE = 1e-6
+# Triangles of a mesh that many rays will be cast at.
+_LARGE = 200_000
 # Rays that are cast one by one in the time that a projection takes to begin.
 _FEW_RAYS = 3000
 
@@ -120,6 +122,8 @@ class Mesh:
         tree = wp.Mesh(
             points=wp.from_torch(self._vertices, dtype=wp.vec3),
             indices=wp.from_torch(self._triangles.view(-1), dtype=wp.int32),
+            # On CUDA Warp would build a tree in no time that rays take longer through: right for a mesh of one scan.
+            bvh_constructor="sah" if len(self._triangles) > _LARGE else None,
         )
         if self.device.type == "cuda":
             wp.synchronize_device(str(self.device))  # and used on torch's again

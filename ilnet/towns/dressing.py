@@ -6,37 +6,11 @@ import numpy as np
 
 from ilnet.towns import furniture, plants, structures
 from ilnet.towns.parts import Part
+from ilnet.towns.plants import Greens
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Street
 
-__all__ = ["Greens", "dress_street", "greenery", "plant_fields", "signals"]
-
-
-Greens = dict[str, list[Part]]
-
-
-def greenery(rng: np.random.Generator) -> Greens:
-    """Prototypes of plants: of the street ("tall"), of gardens ("small"), of the distance ("far"), and others."""
-    return {
-        "tall": [
-            plants.tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 1000, (0.14, 0.33), twigs=4)
-            for _ in range(5)
-        ],
-        "small": [
-            plants.tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 560, (0.13, 0.29)) for _ in range(4)
-        ],
-        "bare": [plants.tree(rng, rng.uniform(7, 10), rng.uniform(2.2, 3.0), 3.3, 0, (0, 0)) for _ in range(2)],
-        "conifer": [plants.conifer(rng, rng.uniform(6, 11), 420) for _ in range(2)],
-        "bush": [plants.bush(rng, rng.uniform(0.6, 1.1), 110) for _ in range(4)],
-        "far": [
-            plants.tree(rng, rng.uniform(9, 14), rng.uniform(3.2, 4.5), 1.5, 420, (0.4, 0.75), twigs=1)
-            for _ in range(3)
-        ],
-    }
-
-
-def _pick(parts: list[Part], rng: np.random.Generator) -> Part:
-    return parts[int(rng.integers(0, len(parts)))]
+__all__ = ["dress_street", "plant_fields", "signals"]
 
 
 def _spread(
@@ -85,7 +59,7 @@ def dress_street(site: Site, street: Street, greens: Greens, rng: np.random.Gene
             stand([furniture.bollard()], 3, 2.2, 0.25, offset, 0.0)
             stand([furniture.bus_shelter()], 45, 150, 1.0, wide, inward)
         if street.pavement > 2.4:
-            trees = greens["tall"] * 3 + greens["bare"]
+            trees = greens.kinds["tall"] * 3 + greens.kinds["bare"]
             stand(trees, 7, rng.uniform(12, 18), 0.75, side * (street.half + 0.9), rng.uniform(0, 6), (0.95, 1.15))
         if street.parking:
             _parking(site, street, side, rng)
@@ -97,7 +71,7 @@ def dress_street(site: Site, street: Street, greens: Greens, rng: np.random.Gene
         inside = ground.edge(xy) > 0.5
         s_tree = inside & (np.arange(len(s)) % 6 == 0)
         for at in xy[s_tree]:
-            site.put(_pick(greens["tall"], rng), at, rng.uniform(0, 6), rng.uniform(1.0, 1.2))
+            site.put(greens.pick(rng, "tall"), at, rng.uniform(0, 6), rng.uniform(1.0, 1.2))
         hedge = plants.hedge(rng, 2.0, 0.8, 0.9)
         for k in np.nonzero(inside[:-1] & inside[1:] & (np.arange(len(s) - 1) % 24 < 14))[0]:
             site.run(hedge, 2.0, xy[k : k + 2])
@@ -123,7 +97,7 @@ def _dress_highway(site: Site, street: Street, greens: Greens, rng: np.random.Ge
         xy, _ = street.at(np.arange(5, street.length - 5, 3.0), side * (street.half + rng.uniform(4, 9)))
         for at in xy[(ground.edge(xy) > 2.5) & ~site.taken(xy) & (rng.random(len(xy)) < 0.4)]:
             kind = str(rng.choice(["bush", "small", "tall"], p=[0.6, 0.2, 0.2]))
-            site.put(_pick(greens[kind], rng), at + rng.uniform(-1.5, 1.5, 2), rng.uniform(0, 6), rng.uniform(0.8, 1.5))
+            site.put(greens.pick(rng, kind), at + rng.uniform(-1.5, 1.5, 2), rng.uniform(0, 6), rng.uniform(0.8, 1.5))
     if street.median:
         xy, heading = line(0.0)
         site.run(structures.concrete_barrier(), 4.0, xy, 0.5)
@@ -160,7 +134,7 @@ def _verge(site: Site, street: Street, side: int, greens: Greens, rng: np.random
         if kind in ("trees", "bank"):
             spots = xy[:: 2 if kind == "trees" else 3]
             for at in spots[(site.ground.edge(spots) > 1.5) & ~site.taken(spots)]:
-                site.put(_pick(greens["tall"] + greens["bare"], rng), at, rng.uniform(0, 6), rng.uniform(0.8, 1.1))
+                site.put(greens.pick(rng, "tall", "bare"), at, rng.uniform(0, 6), rng.uniform(0.8, 1.1))
         s += length + rng.uniform(4, 9)
 
 
@@ -222,27 +196,21 @@ def _power_line(site: Site, street: Street, rng: np.random.Generator) -> None:
                 site.put_at(furniture.wire(hooks[k], hooks[k + 1], rng.uniform(0.3, 0.8)), (0, 0, 0))
 
 
-def _in_sight(site: Site, xy: np.ndarray) -> np.ndarray:
-    """Whether points (N, 2) are within a LiDAR's reach of some street."""
-    road = np.concatenate([street.core[::5] for street in site.ground.streets])
-    return np.linalg.norm(xy[:, None] - road, axis=-1).min(1) < 85
-
-
-def plant_fields(site: Site, greens: dict[str, list[Part]], radius: float, rng: np.random.Generator) -> None:
+def plant_fields(site: Site, greens: Greens, radius: float, rng: np.random.Generator) -> None:
     """Trees between the lots and a ragged treeline around the town at about `radius` metres."""
     turn = np.linspace(0, 2 * np.pi, 130, endpoint=False)
     reach = radius * (1 + 0.05 * np.sin(3 * turn + rng.uniform(0, 6)) + rng.normal(0, 0.02, len(turn)))
     ring = np.column_stack([np.cos(turn), np.sin(turn)])
     # a rounded square reaches into the corners of the ground
     ring *= (reach / np.maximum(np.abs(ring).max(1), 0.8))[:, None]
-    ring = ring[_in_sight(site, ring) & (rng.random(len(ring)) < 0.9)]
+    ring = ring[site.in_sight(ring) & (rng.random(len(ring)) < 0.9)]
     for at in ring:
         if site.free(at[None], 8.0):
-            site.put(_pick(greens["far"], rng), at, rng.uniform(0, 6), rng.uniform(0.7, 1.2))
+            site.put(greens.pick(rng, "far"), at, rng.uniform(0, 6), rng.uniform(0.7, 1.2))
     spots = rng.uniform(-0.95 * radius, 0.95 * radius, (1600, 2))
-    spots = spots[(site.ground.edge(spots) > 6) & ~site.taken(spots) & _in_sight(site, spots)]
+    spots = spots[(site.ground.edge(spots) > 6) & ~site.taken(spots) & site.in_sight(spots)]
     around = 3 * np.column_stack([np.cos(np.arange(8)), np.sin(np.arange(8))])
     for at in spots[:170]:
         if not site.taken(at + around).any():
             kind = str(rng.choice(["small", "bush", "conifer", "far", "bare"], p=[0.35, 0.25, 0.1, 0.25, 0.05]))
-            site.put(_pick(greens[kind], rng), at, rng.uniform(0, 6), rng.uniform(0.8, 1.3))
+            site.put(greens.pick(rng, kind), at, rng.uniform(0, 6), rng.uniform(0.8, 1.3))

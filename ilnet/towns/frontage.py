@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ilnet.towns import buildings, furniture, plants, structures
-from ilnet.towns.dressing import Greens
 from ilnet.towns.parts import Part, boxes, merge, shift
+from ilnet.towns.plants import Greens
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Street
 
@@ -78,16 +78,14 @@ def _garden(
             site.park(lot.world([half - 1.6, y]), lot.yaw + np.pi / 2 + np.pi * int(rng.integers(0, 2)))
     for _ in range(int(rng.integers(1, 5)) if setback > 2 else 0):
         spot = lot.world([rng.uniform(-half, half - 3.5), rng.uniform(front + 0.6, -0.6)])
-        bush = greens["bush"][int(rng.integers(0, len(greens["bush"])))]
         if site.ground.edge(spot)[0] > 1.7:
-            site.put(bush, spot, rng.uniform(0, 6), rng.uniform(0.6, 1.3))
+            site.put(greens.pick(rng, "bush"), spot, rng.uniform(0, 6), rng.uniform(0.6, 1.3))
     for _ in range(int(rng.integers(0, 5))):
         behind = setback < 4 or rng.random() < 0.6
         y = depth + rng.uniform(3, 12) if behind else rng.uniform(front + 1.5, -1.5)
         spot = lot.world([rng.uniform(-half, half), y])
         if site.free(spot, 3.5):
-            trees = greens["conifer" if rng.random() < 0.25 else "small"]
-            tree = trees[int(rng.integers(0, len(trees)))]
+            tree = greens.pick(rng, "conifer" if rng.random() < 0.25 else "small")
             site.put(tree, spot, rng.uniform(0, 6), rng.uniform(0.75, 1.15))
     if rng.random() < 0.5:
         spot = lot.world([[half - 0.6, front + 0.5], [half - 1.4, front + 0.6]])
@@ -230,8 +228,9 @@ def _terrace(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
             parts.append(shift(furniture.railing(end - start), start, front + 0.15, lift))
     parts.append(shift(buildings.house(rng, size.width, size.depth, size.floors, detached=True), z=lift))
     for _ in range(int(rng.integers(1, 5))):
-        bush = greens["bush"][int(rng.integers(0, len(greens["bush"])))]
-        parts.append(shift(bush, rng.uniform(-half + 1, half - 1), rng.uniform(front + 0.9, -1.0), lift))
+        parts.append(
+            shift(greens.pick(rng, "bush"), rng.uniform(-half + 1, half - 1), rng.uniform(front + 0.9, -1.0), lift)
+        )
     at = np.append(lot.origin, low)  # the wall stands on the street's level, and not on that of the house
     site.put_at(merge(parts), at, lot.yaw)
     site.claim(plot)
@@ -353,7 +352,7 @@ def build_lots(site: Site, street: Street, side: int, greens: Greens, rng: np.ra
         site: where to build.
         street: its `frontage` is a key of the styles above, or another word.
         side: 1 right, -1 left.
-        greens: prototypes under "bush", "small", "conifer".
+        greens: plants for the gardens.
         rng: source of the variety.
     """
     if street.frontage not in _STYLES:

@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 
 from ilnet.towns import buildings, furniture, plants, structures
-from ilnet.towns.dressing import Greens
 from ilnet.towns.frontage import Lot
 from ilnet.towns.parts import Part, boxes, merge, place
+from ilnet.towns.plants import Greens
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Street, inside
 
@@ -26,10 +26,6 @@ __all__ = [
 ]
 
 
-def _pick(parts: list[Part], rng: np.random.Generator) -> Part:
-    return parts[int(rng.integers(0, len(parts)))]
-
-
 def _plot(site: Site, street: Street, share: float, side: int, setback: float, width: float, depth: float) -> Lot:
     """Returns a frame beside a street, its rectangle claimed."""
     lot = Lot.beside(street, street.tails[0] + share * (street.length - sum(street.tails)), side, setback)
@@ -40,7 +36,7 @@ def _plot(site: Site, street: Street, share: float, side: int, setback: float, w
 def _grown(site: Site, greens: Greens, kinds: tuple[str, ...], spots: np.ndarray, rng: np.random.Generator) -> None:
     """Plants at spots (N, 2) that are off the carriageways."""
     for at in spots[site.ground.edge(spots) > 1.6]:
-        site.put(_pick(greens[str(rng.choice(kinds))], rng), at, rng.uniform(0, 6), rng.uniform(0.8, 1.2))
+        site.put(greens.pick(rng, str(rng.choice(kinds))), at, rng.uniform(0, 6), rng.uniform(0.8, 1.2))
 
 
 def _enclose(
@@ -272,14 +268,15 @@ def power_line(site: Site, street: Street, right: float, rng: np.random.Generato
 
 
 def fields(site: Site, greens: Greens, rng: np.random.Generator) -> None:
-    """Boundaries of fields away from the lanes: walls, hedges with trees, fences; bales on some."""
-    reach = site.ground.extent - 30.0
-    for _ in range(34):
-        middle, turn, length = rng.uniform(-reach, reach, 2), rng.uniform(0, np.pi), rng.uniform(40, 110)
+    """Boundaries of fields, all much alike in direction: walls, hedges with trees, fences; and bales."""
+    reach, grain = site.ground.extent - 30.0, rng.uniform(0, np.pi)
+    for _ in range(46):
+        middle, length = rng.uniform(-reach, reach, 2), rng.uniform(40, 110)
+        turn = grain + np.pi / 2 * int(rng.integers(0, 2)) + rng.normal(0, 0.08)
         way = np.array([np.cos(turn), np.sin(turn)])
         path = middle + np.linspace(-0.5, 0.5, max(2, round(length / 4)))[:, None] * length * way
         path = path[(np.abs(path) < reach).all(1)]
-        path = path[site.ground.edge(path) > 6]
+        path = path[(site.ground.edge(path) > 6) & ~site.taken(path) & site.in_sight(path)]
         if len(path) < 2:
             continue
         kind = rng.random()

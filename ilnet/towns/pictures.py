@@ -17,14 +17,14 @@ __all__ = ["draw"]
 
 # Where the street is drawn and scanned, as a share of the waypoints; chosen for the view.
 _PLACES = {
-    "town01": 0.1,
-    "town02": 0.1,
-    "town03": 0.5,
-    "town04": 0.1,
-    "town05": 0.1,
-    "town06": 0.1,
-    "town07": 0.1,
-    "town10": 0.1,
+    "town01": 0.2,
+    "town02": 0.03,
+    "town03": 0.12,
+    "town04": 0.08,
+    "town05": 0.5,
+    "town06": 0.55,
+    "town07": 0.5,
+    "town10": 0.02,
 }
 _SENSOR = preset("paper-128x2048")
 _ABOVE, _STREET = (1200, 900), (1200, 600)
@@ -54,10 +54,10 @@ def draw(names: list[str], out: Path) -> list[Path]:
     Raises:
         ValueError: For an unknown name.
     """
-    out.mkdir(parents=True, exist_ok=True)
     files, scans, panels = [], {}, []
     for name in names:
         town = build(name)
+        out.mkdir(parents=True, exist_ok=True)
         number = int(_PLACES[name] * len(town.waypoints))
         at = town.waypoints[number] + np.array([0, 0, SENSOR_HEIGHT], dtype=np.float32)
         heading = float(town.headings[number])
@@ -67,11 +67,12 @@ def draw(names: list[str], out: Path) -> list[Path]:
         panels.append((f"{name}: {len(town.triangles) / 1e6:.2f} M triangles", above, street))
         for view, picture in (("above", above), ("street", street)):
             files.append(out / f"{name}_{view}.jpg")
-            picture.save(files[-1], quality=82)
+            picture.save(files[-1], quality=78)
     files += [out / "range_images.png", out / "points.png", out / "towns.png"]
     height, width = _SENSOR.shape
     plot.range_images(scans, files[-3], f"One scan of {height} by {width} rays in each town")
     plot.point_clouds(scans, files[-2])
+    Image.open(files[-2]).convert("RGB").quantize(96).save(files[-2], optimize=True)
     _sheet(panels).save(files[-1], optimize=True)
     return files
 
@@ -117,7 +118,8 @@ def _painted(town: Town):
     paint = np.full((len(triangles), 3), _COLOURS["wall"], dtype=np.uint8)
     paint[lone & (upright > 0.9)] = _COLOURS["ground"]
     middle = ((a + b + c) / 3)[:, :2]
-    paved = _near(town.waypoints[:, :2], middle, 9) | _near(town.walks[:, :2], middle, 4)
+    kerbs = middle[lone & (upright > 0.98) & (np.abs(twice - 1) < 0.05)]  # where the ground has cells of 1 m
+    paved = _near(kerbs, middle, 6) | _near(town.waypoints[:, :2], middle, 7) | _near(town.walks[:, :2], middle, 4)
     paint[lone & (upright > 0.9) & (twice > 12) & ~paved] = _COLOURS["lawn"]
     paint[lone & (twice < 0.8) & (upright < 0.99)] = _COLOURS["leaf"]
     paint[~lone & (twice > 8) & (upright > 0.3) & (upright < 0.97)] = _COLOURS["roof"]

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ilnet.towns.dressing import Greens, dress_street, greenery, plant_fields
+from ilnet.towns.dressing import dress_street, plant_fields
 from ilnet.towns.frontage import build_lots
+from ilnet.towns.plants import Greens, greenery
 from ilnet.towns.site import Site
 from ilnet.towns.streets import KERB, Ground, Street
 from ilnet.towns.town import Town

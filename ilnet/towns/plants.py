@@ -1,10 +1,12 @@
 """Trees, bushes and hedges with leaves that let some rays through. Prototypes stand at the origin, metres."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ilnet.towns.parts import Part, boxes, merge, tubes
 
-__all__ = ["bush", "conifer", "hedge", "tree"]
+__all__ = ["Greens", "greenery", "hedge"]
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -61,7 +63,7 @@ def _branches(
     return merge(parts), np.concatenate([end, 0.5 * (start + end), tip, trunk[-1:]])
 
 
-def tree(
+def _tree(
     rng: np.random.Generator,
     height: float,
     crown: float,
@@ -89,7 +91,7 @@ def tree(
     return merge([wood, _leaves(at, size, rng)])
 
 
-def conifer(rng: np.random.Generator, height: float, leaves: int) -> Part:
+def _conifer(rng: np.random.Generator, height: float, leaves: int) -> Part:
     """A conifer: whorls of drooping branches, needles as slim triangles."""
     z = np.repeat(np.linspace(0.12, 0.95, 14), 6) * height
     turn = rng.uniform(0, 2 * np.pi, len(z))
@@ -102,7 +104,7 @@ def conifer(rng: np.random.Generator, height: float, leaves: int) -> Part:
     return merge([trunk, tubes(root, tip, 0.03, 0.01, sides=3, caps=False), _leaves(at, (0.2, 0.45), rng)])
 
 
-def bush(rng: np.random.Generator, radius: float, leaves: int) -> Part:
+def _bush(rng: np.random.Generator, radius: float, leaves: int) -> Part:
     """A round bush with a few stems."""
     way = _unit(rng.standard_normal((leaves, 3)))
     way[:, 2] = np.abs(way[:, 2])
@@ -113,10 +115,48 @@ def bush(rng: np.random.Generator, radius: float, leaves: int) -> Part:
 
 def hedge(rng: np.random.Generator, length: float, height: float, width: float) -> Part:
     """A clipped hedge along +x from the origin: a dense core with leaves standing out of it."""
-    core = boxes([0.05, -width / 2 + 0.1, -0.3], [length - 0.05, width / 2 - 0.1, height - 0.1])
-    count = int(length * 22)
+    core = boxes([0.0, -width / 2 + 0.14, -0.3], [length, width / 2 - 0.14, height - 0.14])
+    count = int(length * 38)
     face = rng.uniform(0, 2 * height + width, count)
     y = np.where(face < height, -width / 2, np.where(face > height + width, width / 2, face - height - width / 2))
     z = np.where(face < height, face, np.where(face > height + width, face - height - width, height))
     at = np.column_stack([rng.uniform(0, length, count), y, z]) + rng.normal(0, 0.05, (count, 3))
-    return merge([core, _leaves(at, (0.15, 0.35), rng)])
+    return merge([core, _leaves(at, (0.14, 0.32), rng)])
+
+
+@dataclass(frozen=True)
+class Greens:
+    """A town's prototypes of plants.
+
+    Attributes:
+        kinds: those of the street ("tall"), of gardens ("small", "conifer", "bush"), of the distance ("far"), and trees
+            without leaves ("bare").
+    """
+
+    kinds: dict[str, list[Part]]
+
+    def pick(self, rng: np.random.Generator, *kinds: str) -> Part:
+        """Returns a plant of one of some kinds."""
+        plants = [plant for kind in kinds for plant in self.kinds[kind]]
+        return plants[int(rng.integers(0, len(plants)))]
+
+
+def greenery(rng: np.random.Generator) -> Greens:
+    """Grows the prototypes of a town."""
+    return Greens(
+        {
+            "tall": [
+                _tree(rng, rng.uniform(8, 12), rng.uniform(2.4, 3.4), 3.4, 1000, (0.14, 0.33), twigs=4)
+                for _ in range(5)
+            ],
+            "small": [
+                _tree(rng, rng.uniform(4.5, 7.5), rng.uniform(1.6, 2.6), 1.6, 560, (0.13, 0.29)) for _ in range(4)
+            ],
+            "bare": [_tree(rng, rng.uniform(7, 10), rng.uniform(2.2, 3.0), 3.3, 0, (0, 0)) for _ in range(2)],
+            "conifer": [_conifer(rng, rng.uniform(6, 11), 420) for _ in range(2)],
+            "bush": [_bush(rng, rng.uniform(0.6, 1.1), 110) for _ in range(4)],
+            "far": [
+                _tree(rng, rng.uniform(9, 14), rng.uniform(3.2, 4.5), 1.5, 560, (0.34, 0.6), twigs=1) for _ in range(3)
+            ],
+        }
+    )

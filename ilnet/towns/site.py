@@ -34,8 +34,11 @@ class Site:
         self._parts.append(place(part, position, yaw))
 
     def park(self, xy: ArrayLike, heading: ArrayLike) -> None:
-        """Offer places at xy (N, 2) or (2,) where a car may stand; heading in rad."""
-        self._parking.append(self._spots(xy, heading))
+        """Offer places at xy (N, 2) or (2,) where a car may stand, and claim them; heading in rad."""
+        spots = self._spots(xy, heading)
+        self._parking.append(spots)
+        for along in (-2.0, -1.0, 0.0, 1.0, 2.0):
+            self.claim(spots[:, :2] + along * np.column_stack([np.cos(spots[:, 3]), np.sin(spots[:, 3])]))
 
     def walk(self, xy: ArrayLike, heading: ArrayLike) -> None:
         """Offer places at xy (N, 2) or (2,) where somebody may walk or stand; heading in rad."""
@@ -79,6 +82,11 @@ class Site:
         """Whether something was claimed at points (N, 2)."""
         i, j = np.clip(np.round(points).astype(int) + self.ground.extent, 0, len(self._taken) - 1).T
         return self._taken[i, j]
+
+    def in_sight(self, points: np.ndarray) -> np.ndarray:
+        """Whether points (N, 2) are within a LiDAR's reach of some street."""
+        road = np.concatenate([street.core[::5] for street in self.ground.streets])
+        return np.linalg.norm(points[:, None] - road, axis=-1).min(1) < 85
 
     def claim(self, points: np.ndarray) -> None:
         """Mark points (N, 2) as taken."""

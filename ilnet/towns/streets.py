@@ -11,12 +11,12 @@ __all__ = ["KERB", "Draft", "Ground", "Street", "inside"]
 KERB = 0.12
 _CELL = 4  # coarse ground cell [m]; the kerb is cut on a 1 m grid nested in it
 _FAR = 18.0  # distances to the kerb are kept up to here [m]
-_STEP = 2.0  # between the points of a centreline [m]
+_SPACING = 2.0  # between the points of a centreline [m]
 _TAIL = 150.0  # a street that leaves the town goes on beyond a LiDAR's reach [m]
 _CORNER = 6.0  # blend of two kerb lines [m]; about a 5 m corner radius
 
 
-def _spline(points: np.ndarray, spacing: float = _STEP, closed: bool = False) -> np.ndarray:
+def _spline(points: np.ndarray, spacing: float = _SPACING, closed: bool = False) -> np.ndarray:
     """A Catmull-Rom curve through points (N, 2), resampled to even steps of about `spacing` metres."""
     before, after = 2 * points[:1] - points[1:2], 2 * points[-1:] - points[-2:-1]
     if closed:
@@ -67,7 +67,7 @@ class Street:
     @property
     def core(self) -> np.ndarray:
         """The line (M, 2) without its tails."""
-        first, last = (round(t / _STEP) for t in self.tails)
+        first, last = (round(t / _SPACING) for t in self.tails)
         return self.line[first : len(self.line) - last]
 
     @property
@@ -150,7 +150,7 @@ class Draft:
                 for end in (0, -1):
                     if np.hypot(*(others - line[end]).T).min() > 25:
                         way = line[end] - line[3 if end == 0 else -4]
-                        steps = np.arange(_STEP, _TAIL + 1, _STEP)[:, None] * way / np.hypot(*way)
+                        steps = np.arange(_SPACING, _TAIL + 1, _SPACING)[:, None] * way / np.hypot(*way)
                         more = line[end] + steps
                         line = np.concatenate([more[::-1], line] if end == 0 else [line, more])
                         tails[end] = _TAIL

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from ilnet.towns.dressing import Greens, signals
+from ilnet.towns.dressing import signals
 from ilnet.towns.plan import Plan
+from ilnet.towns.plants import Greens
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Draft, Street
 

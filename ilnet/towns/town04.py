@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ilnet.towns.dressing import Greens
 from ilnet.towns.landmarks import churchyard, fields, noise_walls
 from ilnet.towns.plan import Plan
+from ilnet.towns.plants import Greens
 from ilnet.towns.site import Site
 from ilnet.towns.streets import Draft, Street
 

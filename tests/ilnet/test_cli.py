@@ -196,7 +196,7 @@ BAD = {
     "missing positions": ([*SCENE, "yard.ply", "--at", "x.json"], "x.json"),
     "positions of 2 numbers": ([*SCENE, "yard.ply", "--at", "flat.json"], "flat.json: should be"),
     "positions without a name": ([*SCENE, "yard.ply", "--at", "list.json"], "list.json: should be"),
-    "no positions": ([*SCENE, "yard.ply", "--at", "none.json"], "none.json: holds no position"),
+    "no positions": ([*SCENE, "yard.ply", "--at", "none.json"], "none.json: should be JSON like"),
     "positions far away": ([*SCENE, "yard.ply", "--at", "far.json"], "(900.0, 0.0, 1.8); the mesh spans"),
     "too few positions": ([*SCENE, "yard.ply", "--at", "at.json", "--scans", "2"], "at.json holds 1 positions"),
     "NaN in the mesh": ([*SCENE, "nan.ply", "--at", "at.json"], "nan.ply: holds NaN"),

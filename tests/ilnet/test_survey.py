@@ -175,10 +175,10 @@ def test_survey_prints_a_table_and_draws(files):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{", "should be a JSON object with `positions`"),
-        ('{"positions": [[1, 2, 3]]}', "sensor_height_m"),
-        ('{"positions": [[1, 2]], "sensor_height_m": 1.8}', "a list of .x, y, z. in metres"),
-        ('{"positions": [], "sensor_height_m": 1.8}', "its list of `positions` is empty"),
+        ("{", 'bad.json: should be JSON like {"positions": '),
+        ('{"positions": [[1, 2, 3]]}', "lacks 'sensor_height_m'"),
+        ('{"positions": [[1, 2]], "sensor_height_m": 1.8}', "not a list of .x, y, z."),
+        ('{"positions": [], "sensor_height_m": 1.8}', "not a list of .x, y, z."),
         ('{"positions": [[900, 0, 1.8]], "sensor_height_m": 1.8}', "yard, position 0: the scan has no return between"),
     ],
 )

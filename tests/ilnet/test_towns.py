@@ -6,8 +6,10 @@ import zlib
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from ilnet import towns
+from ilnet.towns import pictures
 from kernels.raycast import Mesh
 
 SENSOR_HEIGHT = 1.8
@@ -213,6 +215,21 @@ def test_no_traffic_where_there_are_no_lanes(town):
     assert vertices.shape == triangles.shape == (0, 3)
     assert vertices.dtype == np.float32
     assert triangles.dtype == np.int32
+
+
+def test_pictures_of_a_town(tmp_path, monkeypatch):
+    monkeypatch.setattr(pictures, "_ABOVE", (120, 90))
+    monkeypatch.setattr(pictures, "_STREET", (120, 60))
+    files = pictures.draw(["town07"], tmp_path / "new")
+    assert {f.name for f in files} == {
+        "town07_above.jpg",
+        "town07_street.jpg",
+        "range_images.png",
+        "points.png",
+        "towns.png",
+    }
+    for file in files:
+        assert np.asarray(Image.open(file).convert("L")).std() > 5  # something is to be seen
 
 
 def test_unknown_name_is_refused():

@@ -69,7 +69,7 @@ def test_an_interrupted_run_goes_on_to_the_same_weights(tmp_path, quick, monkeyp
 
 
 def test_the_figures_are_those_of_the_final_weights(tmp_path, quick, monkeypatch):
-    monkeypatch.setattr(train, "VALIDATE_EVERY", 3)
+    monkeypatch.setattr(train, "VALIDATE_EVERY", (3, 3))
     figures = quick(tmp_path, steps=5)
     model = models.load(tmp_path / "iln-prior.safetensors")
     street = train.data.street()

@@ -1,0 +1,323 @@
+"""The experiments of the paper (Sec. III), and ours: each trains what it needs and writes numbers, a figure and a page.
+
+What is trained stays below the output folder, so that an interrupted experiment goes on where it stopped and several
+share what they have in common. Test scans come from the towns 07 and 10, in which nothing is trained or chosen.
+"""
+
+import csv
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ilnet import evaluate, models, plot, towns, train
+
+__all__ = ["EXPERIMENTS", "Study", "results"]
+
+SIZES = ((64, 1024), (128, 2048), (256, 4096))
+# What the paper reports (Table II): MAE [m], IoU, precision, recall, F1 on CARLA's towns 07 and 10.
+PAPER = {
+    "64x1024": {
+        "lidar-sr": (1.560, 0.233, 0.370, 0.377, 0.373),
+        "bilinear": (2.372, 0.202, 0.322, 0.328, 0.325),
+        "liif": (1.558, 0.258, 0.403, 0.409, 0.406),
+        "iln": (1.536, 0.329, 0.483, 0.486, 0.484),
+    },
+    "128x2048": {
+        "lidar-sr": (1.746, 0.161, 0.262, 0.288, 0.274),
+        "bilinear": (2.591, 0.165, 0.268, 0.287, 0.277),
+        "liif": (1.714, 0.236, 0.372, 0.388, 0.379),
+        "iln": (1.690, 0.331, 0.483, 0.498, 0.491),
+    },
+    "256x4096": {
+        "lidar-sr": (1.735, 0.127, 0.207, 0.245, 0.224),
+        "bilinear": (2.646, 0.163, 0.256, 0.303, 0.277),
+        "liif": (1.923, 0.158, 0.221, 0.356, 0.272),
+        "iln": (1.763, 0.232, 0.353, 0.396, 0.373),
+    },
+}
+
+_COLOURS = {"liif": "#d55e00", "iln": "#0072b2", "iln-prior": "#009e73", "lidar-sr": "#cc79a7", "bilinear": "#999999"}
+
+
+@dataclass(frozen=True)
+class Study:
+    """What experiments share.
+
+    Attributes:
+        preset: Of each training, one of `train.PRESETS`.
+        out: Folder for weights, numbers, figures.
+        scans: Test scans from each test town.
+        seeds: How often a training is repeated where its spread is shown.
+        archive: Stored images, for LiDAR-SR and for the comparison with continuous rays; without it these are left out.
+        measured: Files of measured scans.
+    """
+
+    preset: str
+    out: Path
+    scans: int = 20
+    seeds: int = 3
+    archive: Path | None = None
+    measured: tuple[Path, ...] = ()
+
+    def trained(self, label: str, name: str, seed: int = 0, archive: Path | None = None, **arguments: Any) -> Path:
+        """Trains a network, unless that was done, and returns its file of weights."""
+        folder = self.out / "weights" / label
+        file = folder / f"{name}.safetensors"
+        if not file.exists():
+            train.train(name, self.preset, folder, seed=seed, archive=archive, **arguments)
+        return file
+
+    def compare(self, files: dict[str, str | Path], sizes: Sequence[tuple[int, int]] = SIZES) -> list[dict[str, Any]]:
+        """Measures models, by the names their rows shall bear, on the test towns at several sizes."""
+        rows = []
+        for size in sizes:
+            output = evaluate.INPUT.resize(*size)
+            pairs = [pair for town in towns.TEST for pair in evaluate.town_pairs(town, self.scans, output)]
+            rows += evaluate.evaluate({label: models.load(file) for label, file in files.items()}, pairs)
+        return rows
+
+    def write(self, name: str, rows: Sequence[dict[str, Any]]) -> None:
+        """Writes rows of one kind as NAME.csv."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        with open(self.out / f"{name}.csv", "w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(
+                {key: round(v, 4) if isinstance(v, float) else v for key, v in row.items()} for row in rows
+            )
+
+
+def table(study: Study) -> None:
+    """The paper's Table II: all methods at three sizes."""
+    files: dict[str, str | Path] = {name: name for name in ("nearest", "bilinear", "bilinear-inverse")}
+    files |= {name: study.trained(name, name) for name in ("liif", "iln", "iln-prior")}
+    rows = study.compare(files)
+    if study.archive:
+        for size in SIZES[:2]:  # the third takes more memory than most have
+            times = [target // source for target, source in zip(size, evaluate.INPUT.shape, strict=True)]
+            label = f"lidar-sr-{size[0]}"
+            file = study.trained(label, "lidar-sr", archive=study.archive, rows=times[0], columns=times[1])
+            rows += study.compare({"lidar-sr": file}, [size])
+    study.write("table", rows)
+    figure = Figure(figsize=(10, 3.2), layout="constrained")
+    for axis, (name, paper) in zip(figure.subplots(1, len(SIZES), sharey=True), PAPER.items(), strict=True):
+        found = {row["model"]: row["iou"] for row in rows if row["size"] == name}
+        axis.bar(list(found), list(found.values()), color=[_COLOURS.get(name, "#cccccc") for name in found])
+        theirs = {model: figures[1] for model, figures in paper.items() if model in found}
+        axis.plot(list(theirs), list(theirs.values()), "k_", markersize=18, label="the paper, on CARLA")
+        axis.set_title(name)
+        axis.tick_params("x", rotation=60, labelsize=8)
+    axis.legend(fontsize=8)
+    figure.axes[0].set_ylabel("IoU")
+    figure.savefig(study.out / "table.png", dpi=120)
+    _draw_points(study, files)
+
+
+def _draw_points(study: Study, files: dict[str, str | Path]) -> None:
+    """The same crop of a test scan by every method, as points."""
+    for town in towns.TEST:
+        [(sparse, dense)] = evaluate.town_pairs(town, 1, evaluate.INPUT.resize(*SIZES[1]))
+        shown = {"input": sparse}
+        shown |= {name: models.load(file).upsample(sparse, dense.sensor) for name, file in files.items()}
+        plot.point_clouds({**shown, "truth": dense}, study.out / f"points-{town}.png", reach=20.0)
+
+
+def convergence(study: Study) -> None:
+    """The paper's figure of convergence: test figures in the course of training, over several seeds."""
+    pairs = [pair for town in towns.TEST for pair in evaluate.town_pairs(town, 4, evaluate.INPUT.resize(*SIZES[0]))]
+    rows: list[dict[str, Any]] = []
+    for name in ("liif", "iln"):
+        for seed in range(study.seeds):
+            folder = study.trained(f"{name}-{seed}", name, seed, probe=pairs).parent
+            for log in sorted(folder.glob(f"{name}/from-step-*/metrics.csv")):
+                with open(log) as file:
+                    found = [row for row in csv.DictReader(file) if row.get("test/iou")]
+                for row in found:
+                    figures = {key: float(row[f"test/{key}"]) for key in ("mae", "iou", "floating")}
+                    seconds = float(row["seconds"])
+                    rows.append(
+                        {"model": name, "seed": seed, "step": int(row["step"]) + 1, "seconds": seconds} | figures
+                    )
+    study.write("convergence", rows)
+    figure = Figure(figsize=(10, 3.2), layout="constrained")
+    for axis, (x, y) in zip(figure.subplots(1, 3), (("step", "iou"), ("seconds", "iou"), ("step", "mae")), strict=True):
+        for name in ("liif", "iln"):
+            runs = [[r for r in rows if r["model"] == name and r["seed"] == seed] for seed in range(study.seeds)]
+            values = np.array([[row[y] for row in run] for run in runs])
+            at = np.mean([[row[x] for row in run] for run in runs], axis=0)
+            axis.plot(at, values.mean(0), color=_COLOURS[name], label=name)
+            axis.fill_between(at, values.min(0), values.max(0), color=_COLOURS[name], alpha=0.25)
+        axis.set_xlabel(x)
+        axis.set_ylabel({"iou": "IoU", "mae": "MAE [m]"}[y])
+    axis.legend()
+    figure.savefig(study.out / "convergence.png", dpi=120)
+
+
+def steps_to_reach(rows: Sequence[dict[str, Any]], share: float = 0.1) -> dict[str, float]:
+    """How many more steps LIIF takes to the IoU that ILN has after a share of its budget, means over seeds.
+
+    Returns:
+        `iou` that ILN has then, its `iln_steps`, `liif_steps` (infinite where LIIF never gets there), their `ratio`.
+    """
+    curves: dict[str, dict[int, float]] = {}
+    for name in ("liif", "iln"):
+        steps = sorted({row["step"] for row in rows if row["model"] == name})
+        curves[name] = {
+            step: float(np.mean([row["iou"] for row in rows if row["model"] == name and row["step"] == step]))
+            for step in steps
+        }
+    iln_steps = min(step for step in curves["iln"] if step >= share * max(curves["iln"]))
+    iou = curves["iln"][iln_steps]
+    liif_steps = min((step for step, value in curves["liif"].items() if value >= iou), default=math.inf)
+    return {"iou": iou, "iln_steps": iln_steps, "liif_steps": liif_steps, "ratio": liif_steps / iln_steps}
+
+
+def attention(study: Study) -> None:
+    """The paper's ablation of the number D of attention blocks."""
+    rows = []
+    for depth in (0, 1, 2, 4):
+        file = study.trained("iln-0" if depth == 1 else f"iln-d{depth}", "iln", depth=depth)
+        model = models.load(file)
+        seconds = _frame_time(model)
+        parameters = sum(weight.numel() for weight in model.parameters())
+        for row in study.compare({"iln": file}):
+            rows.append({"depth": depth, "parameters": parameters, "seconds_128x2048": seconds, **row})
+    study.write("attention", rows)
+    _bars(study, "attention", rows, "depth", "attention blocks D")
+
+
+def _frame_time(model: models.Model) -> float:
+    [(scan, truth)] = evaluate.town_pairs(towns.TEST[0], 1, evaluate.INPUT.resize(*SIZES[1]))
+    frames = models.Upsampler(model, scan.sensor, truth.sensor, device=scan.ranges.device)
+    seconds = []
+    for _ in range(4):
+        start = time.perf_counter()
+        frames.ranges(scan).cpu()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)
+
+
+def prior(study: Study) -> None:
+    """Ours: a geometric prior on the weights."""
+    rows = []
+    for kind in ("none", "bilinear", "perspective"):
+        label = "iln-0" if kind == "none" else f"iln-{kind}"
+        file = study.trained(label, "iln") if kind == "none" else study.trained(label, "iln-prior", prior=kind)
+        rows += [{"prior": kind, **row} for row in study.compare({label: file})]
+    study.write("prior", rows)
+    _bars(study, "prior", rows, "prior", "prior")
+
+
+def rays(study: Study) -> None:
+    """Ours: the same budget on stored images, as in the paper, and on rays at continuous directions."""
+    if study.archive is None:
+        raise ValueError(
+            f"stored images are missing: make some with `python -m ilnet simulate --towns {','.join(towns.TRAIN)} "
+            f"--scans 2000 --sizes {train.INPUT_SIZE},{train.TARGET_SIZE} --out DIR`, and name them with --data DIR"
+        )
+    rows = []
+    for learns_from, archive in (("continuous", None), ("stored", study.archive)):
+        for name in ("iln", "iln-prior"):
+            label = {"iln": "iln-0", "iln-prior": "iln-perspective"}[name]
+            file = study.trained(label if archive is None else f"{name}-stored", name, archive=archive)
+            rows += [{"rays": learns_from, **row} for row in study.compare({name: file})]
+    study.write("rays", rows)
+    _bars(study, "rays", [row for row in rows if row["model"] == "iln"], "rays", "learned from (iln)")
+
+
+def _bars(study: Study, name: str, rows: Sequence[dict[str, Any]], by: str, title: str) -> None:
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    for axis, (key, words) in zip(figure.subplots(1, 2), (("iou", "IoU"), ("mae", "MAE [m]")), strict=True):
+        kinds = list(dict.fromkeys(str(row[by]) for row in rows))
+        for number, kind in enumerate(kinds):
+            chosen = [row for row in rows if str(row[by]) == kind]
+            at = np.arange(len(chosen)) + (number - (len(kinds) - 1) / 2) * 0.8 / len(kinds)
+            axis.bar(at, [row[key] for row in chosen], 0.8 / len(kinds), label=kind)
+        axis.set_xticks(range(len(chosen)), [row["size"] for row in chosen])
+        axis.set_ylabel(words)
+    axis.legend(title=title, fontsize=8)
+    figure.savefig(study.out / f"{name}.png", dpi=120)
+
+
+def real(study: Study) -> None:
+    """Ours: measured scans, of which the networks saw none; some beams are kept, all are predicted."""
+    if not study.measured:
+        raise ValueError("no measured scans are named: give some with --measured FILE, such as frames of your sensor")
+    files: dict[str, str | Path] = {name: name for name in ("bilinear", "bilinear-inverse")}
+    files |= {name: study.trained(name, name) for name in ("liif", "iln", "iln-prior")}
+    loaded = {label: models.load(file) for label, file in files.items()}
+    rows = []
+    for path in study.measured:
+        beams = evaluate.scans.read(path).sensor.shape[0]
+        for kept in [count for count in (8, 16, 32) if beams // 16 <= count < beams][-2:]:
+            pair = evaluate.scan_pair(path, kept)
+            rows += [{"scan": path.stem, "beams": kept, **row} for row in evaluate.evaluate(loaded, [pair])]
+    study.write("real", rows)
+    figure = Figure(figsize=(10, 3.4), layout="constrained")
+    axis = figure.subplots()
+    cases = list(dict.fromkeys((row["scan"], row["beams"]) for row in rows))
+    for number, name in enumerate(files):
+        values = [next(r["iou"] for r in rows if (r["scan"], r["beams"]) == c and r["model"] == name) for c in cases]
+        axis.bar(
+            np.arange(len(cases)) + 0.16 * (number - 2), values, 0.16, label=name, color=_COLOURS.get(name, "#555555")
+        )
+    axis.set_xticks(range(len(cases)), [f"{scan}\n{kept} beams" for scan, kept in cases], fontsize=6)
+    axis.set_ylabel("IoU")
+    axis.legend(fontsize=8)
+    figure.savefig(study.out / "real.png", dpi=120)
+
+
+EXPERIMENTS: dict[str, Callable[[Study], None]] = {
+    "table": table,
+    "convergence": convergence,
+    "attention": attention,
+    "prior": prior,
+    "rays": rays,
+    "real": real,
+}
+
+
+def results(study: Study) -> Path:
+    """Writes RESULTS.md: all that experiments left in the folder so far, as tables and figures."""
+    lines = ["# Results", "", f"Preset `{study.preset}`; test scans from {study.scans} waypoints of each test town."]
+    for name, experiment in EXPERIMENTS.items():
+        file = study.out / f"{name}.csv"
+        if not file.exists():
+            continue
+        with open(file, newline="") as text:
+            rows = list(csv.DictReader(text))
+        lines += ["", f"## {name}", "", (experiment.__doc__ or "").strip(), "", f"![{name}]({name}.png)", ""]
+        if name == "convergence":
+            numbers = [{**row, "step": int(row["step"]), "iou": float(row["iou"])} for row in rows]
+            reached = steps_to_reach(numbers)
+            lines += [
+                f"ILN has IoU {reached['iou']:.3f} after {reached['iln_steps']} steps; LIIF after "
+                f"{reached['liif_steps']}: {reached['ratio']:.1f} times as many."
+            ]
+        else:
+            lines += _markdown(_beside_the_paper(rows) if name == "table" else rows)
+    page = study.out / "RESULTS.md"
+    page.write_text("\n".join(lines) + "\n")
+    return page
+
+
+def _beside_the_paper(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows with the paper's MAE and IoU where it has some."""
+    found = []
+    for row in rows:
+        theirs = PAPER[row["size"]].get(row["model"])
+        found.append({**row, "mae, paper": theirs[0] if theirs else "", "iou, paper": theirs[1] if theirs else ""})
+    return found
+
+
+def _markdown(rows: Sequence[dict[str, Any]]) -> list[str]:
+    head = list(rows[0])
+    return [
+        "| " + " | ".join(map(str, line)) + " |" for line in (head, ["---"] * len(head), *(r.values() for r in rows))
+    ]
