@@ -120,17 +120,18 @@ def _verge(site: Site, street: Street, side: int, greens: Greens, rng: np.random
             np.arange(s, min(s + length, street.length), 4.0), side * (street.half + rng.uniform(1.7, 3.0))
         )
         kind = str(rng.choice(["wall", "hedge", "bank", "fence", "trees", "none"]))
-        panel = {
+        panels = {
             "wall": lambda: (structures.stone_wall(rng, rng.uniform(0.8, 1.3)), 3.0),
             "hedge": lambda: (plants.hedge(rng, 4.0, rng.uniform(1.0, 2.2), rng.uniform(0.8, 1.4)), 4.0),
             "bank": lambda: (structures.bank(rng.uniform(0.5, 1.1)), 4.0),
             "fence": lambda: (structures.post_and_rail(), 2.5),
-        }.get(kind)
-        if panel:
+        }
+        if kind in panels:
+            panel, panel_length = panels[kind]()
             for start, end in pairwise(xy):
                 middle = 0.5 * (start + end)
                 if not site.taken(np.array([start, middle, end])).any():
-                    site.run(*panel(), np.array([start, end]), 1.3)
+                    site.run(panel, panel_length, np.array([start, end]), 1.3)
         if kind in ("trees", "bank"):
             spots = xy[:: 2 if kind == "trees" else 3]
             for at in spots[(site.ground.edge(spots) > 1.5) & ~site.taken(spots)]:

@@ -171,7 +171,7 @@ def _from_above(town: Town) -> Image.Image:
     eye = centre + reach * np.array([-0.75, -1.75, 1.75])
     camera = [tuple(eye), tuple(centre - (0, 0.12 * reach, 0)), (0, 0, 1)]
     surfaces = [_painted(town), _lanes(town)]
-    return _render(surfaces, camera, 34, _ABOVE, (reach, 8 * reach), 8.0)
+    return _render(surfaces, camera, 36, _ABOVE, (reach, 8 * reach), 8.0)
 
 
 def _from_the_street(town: Town, about: tuple[np.ndarray, np.ndarray], at: np.ndarray, heading: float) -> Image.Image:

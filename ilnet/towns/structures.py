@@ -5,6 +5,7 @@ Panels run along +x from the origin; what has a front faces +x.
 
 import numpy as np
 
+from ilnet.towns.furniture import railing
 from ilnet.towns.parts import Part, boxes, loft, merge, place, quads, shift, tubes
 from ilnet.towns.vehicles import pedestrian, wheels
 
@@ -18,6 +19,7 @@ __all__ = [
     "guard_rail",
     "mesh_fence",
     "noise_wall",
+    "overpass",
     "parasol",
     "post_and_rail",
     "pylon",
@@ -153,6 +155,24 @@ def gantry(span: float) -> Part:
                 )
             )
     return merge([chords, *lattice, legs, *signs])
+
+
+def overpass(span: float) -> Part:
+    """A bridge along y, centred, that clears 5.6 m, on piers in the middle, with a sloping bank at either end.
+
+    Args:
+        span: between the abutments, metres.
+    """
+    half, top = span / 2, 6.4
+    deck = boxes([[-3.8, -half - 1, 5.6], [-4.0, -half - 1, 6.2]], [[3.8, half + 1, top], [4.0, half + 1, 6.3]])
+    piers = tubes([[x, 0, -2] for x in (-2.6, 0, 2.6)], [[x, 0, 5.6] for x in (-2.6, 0, 2.6)], 0.4, sides=10)
+    parts = [deck, piers, boxes([-3.5, -0.5, 5.0], [3.5, 0.5, 5.6])]
+    rail = place(railing(span + 2, 1.1, 0.2), [[-3.9, -half - 1, top], [3.9, -half - 1, top]], np.pi / 2)
+    for side in (-1, 1):
+        high = [[-4.6, half, top], [4.6, half, top], [8.0, half + 0.6, -3.0], [-8.0, half + 0.6, -3.0]]
+        low = [[-4.6, half + 60, 0.0], [4.6, half + 60, 0.0], [5.0, half + 60, -3.0], [-5.0, half + 60, -3.0]]
+        parts.append(loft(np.array([high, low]) * (1, side, 1)))
+    return merge([*parts, rail])
 
 
 def container(length: float = 6.06) -> Part:
