@@ -20,7 +20,7 @@ _PLACES = {
     "town01": 0.2,
     "town02": 0.03,
     "town03": 0.12,
-    "town04": 0.08,
+    "town04": 0.042,
     "town05": 0.5,
     "town06": 0.55,
     "town07": 0.5,
@@ -122,7 +122,7 @@ def _painted(town: Town):
     paved = _near(kerbs, middle, 6) | _near(town.waypoints[:, :2], middle, 7) | _near(town.walks[:, :2], middle, 4)
     paint[lone & (upright > 0.9) & (twice > 12) & ~paved] = _COLOURS["lawn"]
     paint[lone & (twice < 0.8) & (upright < 0.99)] = _COLOURS["leaf"]
-    paint[~lone & (twice > 8) & (upright > 0.3) & (upright < 0.97)] = _COLOURS["roof"]
+    paint[~lone & (twice > 8) & (upright > 0.45) & (upright < 0.97)] = _COLOURS["roof"]
     return _surface(vertices, triangles, paint)
 
 
