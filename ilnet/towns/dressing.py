@@ -56,8 +56,9 @@ def dress_street(site: Site, street: Street, greens: Greens, rng: np.random.Gene
         _walks(site, street, side, 24.0 if country else 4.0, rng)
         if busy:
             stand([furniture.bench()], 16, 41, 0.7, wide, inward)
+            stand([furniture.cabinet(), furniture.cycle_hoops()], 27, 37, 0.5, wide, inward)
             stand([furniture.bollard()], 3, 2.2, 0.25, offset, 0.0)
-            stand([furniture.bus_shelter()], 45, 150, 1.0, wide, inward)
+            stand([furniture.bus_shelter()], 45, 150, float(street.pavement > 2.0), wide, inward)
         if street.pavement > 2.4:
             trees = greens.kinds["tall"] * 3 + greens.kinds["bare"]
             stand(trees, 7, rng.uniform(12, 18), 0.75, side * (street.half + 0.9), rng.uniform(0, 6), (0.95, 1.15))

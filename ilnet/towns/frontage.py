@@ -323,14 +323,16 @@ class _Style(NamedTuple):
     build: Callable[[Site, Lot, _Size, Greens, np.random.Generator], None]
     gaps: float = 0.0
     """How often there is nothing for a while."""
+    scaffolded: bool = False
+    """Whether some fronts are being repaired."""
 
 
 _STYLES = {
-    "towers": _Style(_towers, _block),
-    "downtown": _Style(_downtown, _tower),
-    "shops": _Style(_shops, _block),
-    "old": _Style(_old, _old_block),
-    "rows": _Style(_rows, _terraced),
+    "towers": _Style(_towers, _block, scaffolded=True),
+    "downtown": _Style(_downtown, _tower, scaffolded=True),
+    "shops": _Style(_shops, _block, scaffolded=True),
+    "old": _Style(_old, _old_block, scaffolded=True),
+    "rows": _Style(_rows, _terraced, scaffolded=True),
     "houses": _Style(_houses, _villa),
     "hillside": _Style(_houses, _terrace),
     "cottages": _Style(_cottages, _villa, 0.12),
@@ -376,4 +378,6 @@ def build_lots(site: Site, street: Street, side: int, greens: Greens, rng: np.ra
             sizes = style.sizes(rng)  # a row that was interrupted does not go on
             continue
         style.build(site, lot, size, greens, rng)
+        if style.scaffolded and street.pavement > 1.8 and rng.random() < 0.06:
+            site.put(structures.scaffold(size.width - 1.0, int(rng.integers(2, 6))), lot.origin, lot.yaw)
         along += size.width + size.space

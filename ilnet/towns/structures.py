@@ -23,6 +23,7 @@ __all__ = [
     "parasol",
     "post_and_rail",
     "pylon",
+    "scaffold",
     "silo",
     "stall",
     "statue",
@@ -240,6 +241,25 @@ def silo(radius: float, height: float) -> Part:
     hoops = tubes([[0, 0, v] for v in z], [[0, 0, v + 0.12] for v in z], radius + 0.06, sides=18)
     pipe = tubes([radius + 0.3, 0, 0], [radius + 0.3, 0, height + 0.5 * radius], 0.15, sides=6)
     return merge([shell, *dome, hoops, pipe])
+
+
+def scaffold(width: float, lifts: int) -> Part:
+    """A scaffold along x, centred, before a wall at y = 0, 1.1 m deep: standards, ledgers, braces, boards.
+
+    Args:
+        width: metres.
+        lifts: how many decks, 2 m apart.
+    """
+    x = np.linspace(-width / 2, width / 2, max(2, round(width / 2.4) + 1))
+    top, z = 2.0 * lifts + 1.1, 2.0 * np.arange(1, lifts + 1)
+    uprights = np.array([[v, y, -0.3] for v in x for y in (-1.2, -0.25)])
+    standards = tubes(uprights, uprights * (1, 1, 0) + (0, 0, top), 0.025, sides=5)
+    bars = [(y, v) for v in z for y in (-1.2, -0.25)] + [(-1.2, v + h) for v in z for h in (0.5, 1.0)]
+    ledgers = tubes([[x[0], y, v] for y, v in bars], [[x[-1], y, v] for y, v in bars], 0.025, sides=4, caps=False)
+    foot = np.array([[a, -1.2, 2.0 * k] for k in range(lifts) for a in x[:-1:2]])
+    braces = tubes(foot, np.add(foot, (x[1] - x[0], 0, 2.0)), 0.022, caps=False)
+    boards = boxes([[x[0], -1.15, v] for v in z], [[x[-1], -0.3, v + 0.05] for v in z])
+    return merge([standards, ledgers, braces, boards])
 
 
 def bale() -> Part:
