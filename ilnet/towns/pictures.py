@@ -23,7 +23,7 @@ _PLACES = {
     "town04": 0.042,
     "town05": 0.5,
     "town06": 0.55,
-    "town07": 0.5,
+    "town07": 0.2,
     "town10": 0.02,
 }
 _SENSOR = preset("paper-128x2048")

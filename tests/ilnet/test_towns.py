@@ -229,6 +229,14 @@ def test_no_traffic_where_there_are_no_lanes(town):
     assert triangles.dtype == np.int32
 
 
+@pytest.mark.parametrize("at", [(0.0, 0.0), (0.0, float("nan"), 1.8)])
+def test_traffic_refuses_what_is_no_position(at):
+    none = np.zeros((0, 3), dtype=np.float32)
+    nowhere = towns.Town("nowhere", 0, none, none.astype(np.int32), none, none[:, 0], none, none)
+    with pytest.raises(ValueError, match=r"^at is .*three finite numbers"):
+        towns.traffic(nowhere, at, 0)
+
+
 def test_pictures_of_a_town(tmp_path, monkeypatch):
     monkeypatch.setattr(pictures, "_ABOVE", (120, 90))
     monkeypatch.setattr(pictures, "_STREET", (120, 60))
