@@ -1,4 +1,4 @@
-"""Procedural towns: streets of triangles to drive a simulated LiDAR through."""
+"""Procedural towns: streets of triangles to drive a simulated LiDAR through, and traffic drawn anew for each scan."""
 
 from ilnet.towns import town01, town02, town03, town04, town05, town06, town07, town10
 from ilnet.towns.plan import raise_town

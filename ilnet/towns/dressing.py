@@ -56,8 +56,9 @@ def dress_street(site: Site, street: Street, greens: Greens, rng: np.random.Gene
         _walks(site, street, side, 24.0 if country else 4.0, rng)
         if busy:
             stand([furniture.bench()], 16, 41, 0.7, wide, inward)
+            stand([furniture.cabinet(), furniture.cycle_hoops()], 27, 37, 0.5, wide, inward)
             stand([furniture.bollard()], 3, 2.2, 0.25, offset, 0.0)
-            stand([furniture.bus_shelter()], 45, 150, 1.0, wide, inward)
+            stand([furniture.bus_shelter()], 45, 150, float(street.pavement > 2.0), wide, inward)
         if street.pavement > 2.4:
             trees = greens.kinds["tall"] * 3 + greens.kinds["bare"]
             stand(trees, 7, rng.uniform(12, 18), 0.75, side * (street.half + 0.9), rng.uniform(0, 6), (0.95, 1.15))
@@ -120,17 +121,18 @@ def _verge(site: Site, street: Street, side: int, greens: Greens, rng: np.random
             np.arange(s, min(s + length, street.length), 4.0), side * (street.half + rng.uniform(1.7, 3.0))
         )
         kind = str(rng.choice(["wall", "hedge", "bank", "fence", "trees", "none"]))
-        panel = {
+        panels = {
             "wall": lambda: (structures.stone_wall(rng, rng.uniform(0.8, 1.3)), 3.0),
             "hedge": lambda: (plants.hedge(rng, 4.0, rng.uniform(1.0, 2.2), rng.uniform(0.8, 1.4)), 4.0),
             "bank": lambda: (structures.bank(rng.uniform(0.5, 1.1)), 4.0),
             "fence": lambda: (structures.post_and_rail(), 2.5),
-        }.get(kind)
-        if panel:
+        }
+        if kind in panels:
+            panel, panel_length = panels[kind]()
             for start, end in pairwise(xy):
                 middle = 0.5 * (start + end)
                 if not site.taken(np.array([start, middle, end])).any():
-                    site.run(*panel(), np.array([start, end]), 1.3)
+                    site.run(panel, panel_length, np.array([start, end]), 1.3)
         if kind in ("trees", "bank"):
             spots = xy[:: 2 if kind == "trees" else 3]
             for at in spots[(site.ground.edge(spots) > 1.5) & ~site.taken(spots)]:

@@ -87,6 +87,7 @@ def _garden(
         if site.free(spot, 3.5):
             tree = greens.pick(rng, "conifer" if rng.random() < 0.25 else "small")
             site.put(tree, spot, rng.uniform(0, 6), rng.uniform(0.75, 1.15))
+            site.claim(spot)
     if rng.random() < 0.5:
         spot = lot.world([[half - 0.6, front + 0.5], [half - 1.4, front + 0.6]])
         spot = spot[site.ground.edge(spot) > 0.5]
@@ -254,37 +255,40 @@ def _factory(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.G
     spots = spots[np.abs(spots - gate) > 6]
     site.park(lot.world(np.column_stack([spots, np.full(len(spots), front + 3.6)])), lot.yaw + np.pi / 2)
     site.walk(lot.world(np.column_stack([spots[::3], np.full(len(spots[::3]), front + 8.0)])), lot.yaw)
+    _store(site, lot, size, half, rng)
+    office = lot.moved(rng.choice([-1, 1]) * (size.width / 2 - 5.5), -5.0)
+    foot = site.footprint(office.origin, office.yaw, 10.0, 5.0)
+    away = np.hypot(*(office.origin - lot.world([gate, -5.0])[0]))
+    if rng.random() < 0.25 and away > 7 and site.ground.edge(foot).min() > 1.0:
+        part = buildings.block(rng, 10.0, 5.0, int(rng.integers(2, 4)), "flats", "flat")
+        site.put(part, office.origin, office.yaw)
+    site.put(furniture.lamp(9.0, 1.8), lot.world([-half + 1.0, front + 1.0]), lot.yaw + np.pi / 2)
+    site.claim(site.footprint(lot.moved(0, front).origin, lot.yaw, 2 * half, size.depth - front))
+
+
+def _store(site: Site, lot: Lot, size: _Size, half: float, rng: np.random.Generator) -> None:
+    """What a yard of twice the width `half` holds: trailers at docks, containers, pallets; a tank or silos beside."""
+    ground = site.ground
     for x in np.arange(-half + 4, half - 2, 7.0):
         kind = rng.random()
-        if site.ground.edge(lot.world([[x, -1.0], [x, -14.0]])).min() < 2.0:
+        if ground.edge(lot.world([[x, -1.0], [x, -14.0]])).min() < 2.0:
             continue
-        spot = lot.world([x, -7.2 + rng.uniform(-0.6, 0.3)])
         if kind < 0.22 and size.setback > 15:
-            site.put(structures.trailer(), spot, lot.yaw - np.pi / 2)
+            site.put(structures.trailer(), lot.world([x, -7.2 + rng.uniform(-0.6, 0.3)]), lot.yaw - np.pi / 2)
         elif kind < 0.36:
             site.put(structures.container(), lot.world([x, -2.2]), lot.yaw + rng.normal(0, 0.03))
         elif kind < 0.46:
-            stack = merge(
-                [boxes([-0.6, -0.5, 0.15 * k], [0.6, 0.5, 0.15 * k + 0.12]) for k in range(int(rng.integers(3, 10)))]
-            )
+            z = 0.15 * np.arange(int(rng.integers(3, 10)))[:, None]
+            stack = boxes(np.array([-0.6, -0.5, 0.0]) + z * (0, 0, 1), np.array([0.6, 0.5, 0.12]) + z * (0, 0, 1))
             site.put(stack, lot.world(np.column_stack([x + 1.4 * np.arange(3), np.full(3, -1.5)])), lot.yaw)
     edge = size.width / 2 + 0.2 * size.space
     kind = rng.random()
-    if site.ground.edge(lot.world([[edge + 8.0, 6.0], [edge, 0.0]])).min() < 4.0:
-        pass  # a street runs there
-    elif kind < 0.3 and size.space > 14:
+    if ground.edge(lot.world([[edge + 8.0, 6.0], [edge, 0.0]])).min() < 4.0:
+        return
+    if kind < 0.3 and size.space > 14:
         site.put(structures.tank(2.6, rng.uniform(5, 9)), lot.world([edge + 2.0, 6.0]), lot.yaw)
     elif kind < 0.5 and size.space > 12:
         site.put(structures.silo(1.7, rng.uniform(8, 13)), lot.world([[edge, 4.0], [edge, 8.2]]), lot.yaw)
-    elif kind < 0.7:  # an office in front of the hall
-        office = lot.moved(rng.choice([-1, 1]) * (size.width / 2 - 5.5), -5.0)
-        foot = site.footprint(office.origin, office.yaw, 10.0, 5.0)
-        if np.hypot(*(office.origin - lot.world([gate, -5.0])[0])) > 7 and site.ground.edge(foot).min() > 1.0:
-            site.put(
-                buildings.block(rng, 10.0, 5.0, int(rng.integers(2, 4)), "flats", "flat"), office.origin, office.yaw
-            )
-    site.put(furniture.lamp(9.0, 1.8), lot.world([-half + 1.0, front + 1.0]), lot.yaw + np.pi / 2)
-    site.claim(site.footprint(lot.moved(0, front).origin, lot.yaw, 2 * half, size.depth - front))
 
 
 def _farm(site: Site, lot: Lot, size: _Size, greens: Greens, rng: np.random.Generator) -> None:
@@ -319,14 +323,16 @@ class _Style(NamedTuple):
     build: Callable[[Site, Lot, _Size, Greens, np.random.Generator], None]
     gaps: float = 0.0
     """How often there is nothing for a while."""
+    scaffolded: bool = False
+    """Whether some fronts are being repaired."""
 
 
 _STYLES = {
-    "towers": _Style(_towers, _block),
-    "downtown": _Style(_downtown, _tower),
-    "shops": _Style(_shops, _block),
-    "old": _Style(_old, _old_block),
-    "rows": _Style(_rows, _terraced),
+    "towers": _Style(_towers, _block, scaffolded=True),
+    "downtown": _Style(_downtown, _tower, scaffolded=True),
+    "shops": _Style(_shops, _block, scaffolded=True),
+    "old": _Style(_old, _old_block, scaffolded=True),
+    "rows": _Style(_rows, _terraced, scaffolded=True),
     "houses": _Style(_houses, _villa),
     "hillside": _Style(_houses, _terrace),
     "cottages": _Style(_cottages, _villa, 0.12),
@@ -372,4 +378,6 @@ def build_lots(site: Site, street: Street, side: int, greens: Greens, rng: np.ra
             sizes = style.sizes(rng)  # a row that was interrupted does not go on
             continue
         style.build(site, lot, size, greens, rng)
+        if style.scaffolded and street.pavement > 1.8 and rng.random() < 0.06:
+            site.put(structures.scaffold(size.width - 1.0, int(rng.integers(2, 6))), lot.origin, lot.yaw)
         along += size.width + size.space

@@ -2,13 +2,15 @@
 
 import numpy as np
 
-from ilnet.towns.parts import Part, boxes, merge, polyline_tubes, tubes
+from ilnet.towns.parts import Part, boxes, merge, place, polyline_tubes, tubes
 
 __all__ = [
     "bench",
     "bin_",
     "bollard",
     "bus_shelter",
+    "cabinet",
+    "cycle_hoops",
     "fence",
     "lamp",
     "pole",
@@ -103,6 +105,17 @@ def bin_(wheeled: bool) -> Part:
         )
     body = tubes([0, 0, 0.06], [0, 0, 1.0], 0.34, 0.42, sides=4)
     return merge([body, boxes([-0.32, -0.32, 1.0], [0.34, 0.32, 1.06]), boxes([-0.42, -0.3, 0.95], [-0.36, 0.3, 1.0])])
+
+
+def cabinet() -> Part:
+    """A cabinet of the telephone or power company."""
+    return merge([boxes([-0.2, -0.6, 0], [0.2, 0.6, 1.25]), boxes([-0.24, -0.64, 1.25], [0.24, 0.64, 1.3])])
+
+
+def cycle_hoops() -> Part:
+    """Five hoops to lean bicycles against, in a row along y."""
+    hoop = [[-0.35, 0, 0], [-0.35, 0, 0.65], [-0.25, 0, 0.8], [0.25, 0, 0.8], [0.35, 0, 0.65], [0.35, 0, 0]]
+    return place(polyline_tubes(hoop, 0.025, sides=5), [[0, y, 0] for y in (-1.6, -0.8, 0, 0.8, 1.6)])
 
 
 def pole() -> Part:

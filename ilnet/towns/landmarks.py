@@ -12,6 +12,7 @@ from ilnet.towns.site import Site
 from ilnet.towns.streets import Street, inside
 
 __all__ = [
+    "bridge",
     "churchyard",
     "container_yard",
     "fields",
@@ -214,6 +215,20 @@ def noise_walls(site: Site, street: Street, side: int, start: float, end: float,
     xy, _ = street.at(np.arange(start * length, end * length, 4.0), side * (street.half + 3.2))
     site.run(structures.noise_wall(rng.uniform(3.5, 4.5)), 4.0, xy, 2.0)
     site.claim(xy)
+
+
+def bridge(site: Site, street: Street, share: float) -> None:
+    """A bridge over a highway at a share of its length, with its banks."""
+    at, heading = street.at(np.array([share * street.length]), 0.0)
+    across = np.arange(-street.half - 70.0, street.half + 71.0)
+    left = np.array([-np.sin(heading[0]), np.cos(heading[0])])
+    line = at + across[:, None] * left
+    deck = line[np.abs(across) < street.half]
+    z = float(site.ground.height(deck).max())
+    site.put_at(structures.overpass(2 * street.half + 11.0), [*at[0], z], heading)
+    along = np.array([left[1], -left[0]])
+    banks = line[np.abs(across) > street.half + 3]
+    site.claim(np.concatenate([banks + step * along for step in np.arange(-9.0, 9.5)]))
 
 
 def tank_farm(site: Site, street: Street, share: float, side: int, rng: np.random.Generator) -> None:

@@ -20,10 +20,10 @@ _PLACES = {
     "town01": 0.2,
     "town02": 0.03,
     "town03": 0.12,
-    "town04": 0.08,
+    "town04": 0.042,
     "town05": 0.5,
     "town06": 0.55,
-    "town07": 0.5,
+    "town07": 0.2,
     "town10": 0.02,
 }
 _SENSOR = preset("paper-128x2048")
@@ -122,7 +122,7 @@ def _painted(town: Town):
     paved = _near(kerbs, middle, 6) | _near(town.waypoints[:, :2], middle, 7) | _near(town.walks[:, :2], middle, 4)
     paint[lone & (upright > 0.9) & (twice > 12) & ~paved] = _COLOURS["lawn"]
     paint[lone & (twice < 0.8) & (upright < 0.99)] = _COLOURS["leaf"]
-    paint[~lone & (twice > 8) & (upright > 0.3) & (upright < 0.97)] = _COLOURS["roof"]
+    paint[~lone & (twice > 8) & (upright > 0.45) & (upright < 0.97)] = _COLOURS["roof"]
     return _surface(vertices, triangles, paint)
 
 
@@ -171,7 +171,7 @@ def _from_above(town: Town) -> Image.Image:
     eye = centre + reach * np.array([-0.75, -1.75, 1.75])
     camera = [tuple(eye), tuple(centre - (0, 0.12 * reach, 0)), (0, 0, 1)]
     surfaces = [_painted(town), _lanes(town)]
-    return _render(surfaces, camera, 34, _ABOVE, (reach, 8 * reach), 8.0)
+    return _render(surfaces, camera, 36, _ABOVE, (reach, 8 * reach), 8.0)
 
 
 def _from_the_street(town: Town, about: tuple[np.ndarray, np.ndarray], at: np.ndarray, heading: float) -> Image.Image:

@@ -5,6 +5,7 @@ Panels run along +x from the origin; what has a front faces +x.
 
 import numpy as np
 
+from ilnet.towns.furniture import railing
 from ilnet.towns.parts import Part, boxes, loft, merge, place, quads, shift, tubes
 from ilnet.towns.vehicles import pedestrian, wheels
 
@@ -18,9 +19,11 @@ __all__ = [
     "guard_rail",
     "mesh_fence",
     "noise_wall",
+    "overpass",
     "parasol",
     "post_and_rail",
     "pylon",
+    "scaffold",
     "silo",
     "stall",
     "statue",
@@ -155,6 +158,24 @@ def gantry(span: float) -> Part:
     return merge([chords, *lattice, legs, *signs])
 
 
+def overpass(span: float) -> Part:
+    """A bridge along y, centred, that clears 5.6 m, on piers in the middle, with a sloping bank at either end.
+
+    Args:
+        span: between the abutments, metres.
+    """
+    half, top = span / 2, 6.4
+    deck = boxes([[-3.8, -half - 1, 5.6], [-4.0, -half - 1, 6.2]], [[3.8, half + 1, top], [4.0, half + 1, 6.3]])
+    piers = tubes([[x, 0, -2] for x in (-2.6, 0, 2.6)], [[x, 0, 5.6] for x in (-2.6, 0, 2.6)], 0.4, sides=10)
+    parts = [deck, piers, boxes([-3.5, -0.5, 5.0], [3.5, 0.5, 5.6])]
+    rail = place(railing(span + 2, 1.1, 0.2), [[-3.9, -half - 1, top], [3.9, -half - 1, top]], np.pi / 2)
+    for side in (-1, 1):
+        high = [[-4.6, half, top], [4.6, half, top], [8.0, half + 0.6, -3.0], [-8.0, half + 0.6, -3.0]]
+        low = [[-4.6, half + 60, 0.0], [4.6, half + 60, 0.0], [5.0, half + 60, -3.0], [-5.0, half + 60, -3.0]]
+        parts.append(loft(np.array([high, low]) * (1, side, 1)))
+    return merge([*parts, rail])
+
+
 def container(length: float = 6.06) -> Part:
     """A shipping container along x, centred, with folded sides."""
     count = int(length / 0.28) * 2
@@ -220,6 +241,25 @@ def silo(radius: float, height: float) -> Part:
     hoops = tubes([[0, 0, v] for v in z], [[0, 0, v + 0.12] for v in z], radius + 0.06, sides=18)
     pipe = tubes([radius + 0.3, 0, 0], [radius + 0.3, 0, height + 0.5 * radius], 0.15, sides=6)
     return merge([shell, *dome, hoops, pipe])
+
+
+def scaffold(width: float, lifts: int) -> Part:
+    """A scaffold along x, centred, before a wall at y = 0, 1.1 m deep: standards, ledgers, braces, boards.
+
+    Args:
+        width: metres.
+        lifts: how many decks, 2 m apart.
+    """
+    x = np.linspace(-width / 2, width / 2, max(2, round(width / 2.4) + 1))
+    top, z = 2.0 * lifts + 1.1, 2.0 * np.arange(1, lifts + 1)
+    uprights = np.array([[v, y, -0.3] for v in x for y in (-1.2, -0.25)])
+    standards = tubes(uprights, uprights * (1, 1, 0) + (0, 0, top), 0.025, sides=5)
+    bars = [(y, v) for v in z for y in (-1.2, -0.25)] + [(-1.2, v + h) for v in z for h in (0.5, 1.0)]
+    ledgers = tubes([[x[0], y, v] for y, v in bars], [[x[-1], y, v] for y, v in bars], 0.025, sides=4, caps=False)
+    foot = np.array([[a, -1.2, 2.0 * k] for k in range(lifts) for a in x[:-1:2]])
+    braces = tubes(foot, np.add(foot, (x[1] - x[0], 0, 2.0)), 0.022, caps=False)
+    boards = boxes([[x[0], -1.15, v] for v in z], [[x[-1], -0.3, v + 0.05] for v in z])
+    return merge([standards, ledgers, braces, boards])
 
 
 def bale() -> Part:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ilnet.towns.landmarks import churchyard, fields, noise_walls
+from ilnet.towns.landmarks import bridge, churchyard, fields, noise_walls
 from ilnet.towns.plan import Plan
 from ilnet.towns.plants import Greens
 from ilnet.towns.site import Site
@@ -53,8 +53,9 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
 
 
 def _landmarks(site: Site, streets: dict[str, Street], greens: Greens, rng: np.random.Generator) -> None:
-    """Walls that keep the noise from the settlement, its church, and fields."""
+    """Walls that keep the noise from the settlement, a bridge, a church, and fields."""
     noise_walls(site, streets["highway"], -1, 0.36, 0.66, rng)
+    bridge(site, streets["highway"], 0.51)
     churchyard(site, streets["village"], 0.72, greens, rng)
     fields(site, greens, rng)
 

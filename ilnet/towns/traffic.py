@@ -75,9 +75,14 @@ def traffic(
 
     Returns:
         Vertices (V, 3) float32 [m] and triangles (F, 3) int32; empty where nothing is about.
+
+    Raises:
+        ValueError: If `at` is not three finite numbers.
     """
-    rng = np.random.default_rng(seed)
-    sensor = np.asarray(at, dtype=np.float64)[:2]
+    position = np.asarray(at, dtype=np.float64)
+    if position.shape != (3,) or not np.isfinite(position).all():
+        raise ValueError(f"at is {at!r}, should be three finite numbers: x, y, z in metres")
+    rng, sensor = np.random.default_rng(seed), position[:2]
     near = np.nonzero(_distance(town.waypoints, sensor) < radius)[0]
     lane = np.column_stack([town.waypoints[near], town.headings[near]]).astype(np.float64)
     slope = _slope(town, near)
