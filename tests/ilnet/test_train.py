@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.utils.data import get_worker_info
 
 from ilnet import data, metrics, models, train
 from ilnet.sensor import preset
@@ -42,6 +43,17 @@ def test_the_same_seed_gives_the_same_weights(tmp_path, quick):
         weights.append(models.load(tmp_path / str(number) / "iln-prior.safetensors").state_dict())
     assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
     assert not torch.equal(weights[0]["position.weight"], weights[2]["position.weight"])
+
+
+def test_a_worker_makes_the_batches_where_cores_are_to_spare(tmp_path, quick, monkeypatch):
+    asked = []
+    numbers = data._numbers
+    monkeypatch.setattr(data, "_numbers", lambda start: asked.append(get_worker_info()) or numbers(start))
+    alone = quick(tmp_path / "alone")
+    assert asked == [None]
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
+    assert quick(tmp_path / "beside") == alone
+    assert asked == [None]  # asked elsewhere
 
 
 def test_an_interrupted_run_goes_on_to_the_same_weights(tmp_path, quick, monkeypatch):
