@@ -35,6 +35,7 @@ import io
 import math
 
 import matplotlib.pyplot as plt
+import numpy as np
 import PIL.Image
 import pyvista
 import torch
@@ -56,7 +57,7 @@ device = "cuda" if torch.cuda.is_available() else "cpu"
 # A town has no colours and no names of things: only points in metres (x east, y north, z up), triangles between them,
 # and *waypoints* on its lanes where a car could be.
 #
-# **Predict:** a town of about 670 m × 670 m, with houses, trees and parked cars. How many triangles is that?
+# **Predict:** a town of about 650 m × 650 m, with houses, trees and fences. How many triangles is that?
 
 # %%
 town = towns.build("town01")
@@ -67,17 +68,22 @@ east, north, _ = town.vertices.max(axis=0)
 print(f"{east - west:.0f} m from west to east, {north - south:.0f} m from south to north")
 
 # %% [markdown]
-# We stand at waypoint 400 and look from above, then along the lane. A waypoint lies on the road; the LiDAR sits 1.8 m
-# above it, on the roof of the car.
+# We stand at waypoint 1445 and look from above, then along the lane. A waypoint lies on the road; the LiDAR sits 1.8 m
+# above it, on the roof of the car. What moves is not part of a town: `towns.traffic` draws cars and people around us,
+# others for each seed.
 
 # %%
-WAYPOINT, SENSOR_HEIGHT = 400, 1.8
+WAYPOINT, SENSOR_HEIGHT = 1445, 1.8
 lidar = torch.tensor(town.waypoints[WAYPOINT]) + torch.tensor([0.0, 0.0, SENSOR_HEIGHT])
 heading = float(town.headings[WAYPOINT])
 ahead = torch.tensor([math.cos(heading), math.sin(heading), 0.0])
 
-surface = pyvista.PolyData.from_regular_faces(town.vertices, town.triangles)
-surface["height [m]"] = town.vertices[:, 2]
+cars, car_triangles = towns.traffic(town, lidar.numpy(), seed=0)
+vertices = np.concatenate([town.vertices, cars])
+triangles = np.concatenate([town.triangles, car_triangles + len(town.vertices)])
+
+surface = pyvista.PolyData.from_regular_faces(vertices, triangles)
+surface["height [m]"] = vertices[:, 2]
 
 
 def picture(plotter):
@@ -107,7 +113,7 @@ picture(plotter)
 # %% [markdown]
 # *In words: two pictures coloured by height, from grey-blue ground to yellow roofs. Left, the town from above: rows of
 # houses along a few crossing streets, an orange dot at our waypoint near the middle. Right, what we see from there: a
-# grey road ahead, a tree and a kerb on the left, parked cars on both sides, tall houses behind them.*
+# grey road ahead, a parked car and a bench on the left, people on the pavement, trees, house fronts on both sides.*
 
 # %% [markdown]
 # ## 2. One ray
@@ -123,7 +129,7 @@ picture(plotter)
 # **Predict:** what range comes back from a ray straight down?
 
 # %%
-mesh = Mesh(town.vertices, town.triangles, device)
+mesh = Mesh(vertices, triangles, device)
 origin = lidar.to(device)
 
 down = mesh.cast(origin, torch.tensor([0.0, 0.0, -1.0], device=device), max_range=80.0)
@@ -159,7 +165,7 @@ print(f"   along y axis: {axis.range:.2f} m, triangle {axis.triangle}, cosine {a
 # $\mathbf n \cdot (\mathbf p - \mathbf v_0) = 0$.
 
 # %%
-v0, v1, v2 = torch.tensor(town.vertices[town.triangles[slant.triangle.item()]], device=device)
+v0, v1, v2 = torch.tensor(vertices[triangles[slant.triangle.item()]], device=device)
 normal = torch.nn.functional.normalize(torch.linalg.cross(v1 - v0, v2 - v0), dim=0)
 
 p = origin + slant.range * slanted  # p = o + r d
@@ -235,12 +241,12 @@ for row in range(7):
 
 road = scan.ranges[:7, ahead_column]
 assert (road.diff() > 0).all()  # the higher the beam, the farther it touches the road
-assert road[6] - road[5] > 15 * (road[1] - road[0])
+assert road[6] - road[5] > 12 * (road[1] - road[0])
 assert dense.ranges.numel() == 16 * scan.ranges.numel()
 
 # %% [markdown]
 # One road, many ranges: a level road has range $h / \sin(-\epsilon)$ for a sensor at height $h$. The same two degrees
-# between two beams are one metre of road near the car, and more than fifteen times as much at the last two beams that
+# between two beams are one metre of road near the car, and more than twelve times as much at the last two beams that
 # touch it. What lies in between, the coarse sensor does not say.
 
 # %% [markdown]
@@ -276,8 +282,8 @@ picture(plotter)
 
 # %% [markdown]
 # *In words: the same place as two point clouds, seen from above and behind, coloured by height. Left, the coarse scan:
-# six thin rings on the ground with wide empty gaps, a few dashes where cars and trees are. Right, the dense scan: close
-# rings, parked cars, tree trunks with crowns, a house front, and the shadows that they throw.*
+# six thin rings on the ground with wide empty gaps, a few dashes where poles and trees are. Right, the dense scan: close
+# rings, cars, tree trunks with crowns, house fronts, and the shadows that they throw.*
 
 # %% [markdown]
 # ## 5. Between the beams
@@ -367,8 +373,8 @@ assert errors["perspective"] < 0.05
 number_line("on the road", neighbours[0], blends, truth)
 
 # %% [markdown]
-# *In words: a line of ranges. Two neighbours near 15 m, two near 22 m. The diamond of the perspective blend lies on the
-# truth at 16.7 m, bilinear half a metre too far, the mean almost two metres too far.*
+# *In words: a line of ranges. Two neighbours near 15 m, two near 20 m. The diamond of the perspective blend lies on the
+# truth at 16.0 m, bilinear 0.4 m too far, the mean 1.6 m too far.*
 #
 # The perspective blend knows that roads and walls are flat. No network is needed for that.
 
@@ -400,8 +406,8 @@ for prior in PRIORS:
 number_line("at an edge", neighbours[0], {prior: blends[prior][0] for prior in PRIORS}, truth[0])
 
 # %% [markdown]
-# *In words: a line of ranges. Two neighbours near 17 m, two near 69 m, the truth among the far ones. The three blends
-# are scattered between, 20 m and more from the truth.*
+# *In words: a line of ranges. Two neighbours near 30 m, two near 78 m, the truth among the far ones. The three blends
+# are scattered between, 24 m and more from the truth.*
 #
 # Every blend made up a point between what is in front and what is behind. Is there really nothing? We stand at each
 # made-up point and cast rays in all directions: the shortest range says how far the nearest surface is. Then we look at
