@@ -282,8 +282,8 @@ picture(plotter)
 
 # %% [markdown]
 # *In words: the same place as two point clouds, seen from above and behind, coloured by height. Left, the coarse scan:
-# six thin rings on the ground with wide empty gaps, a few dashes where poles and trees are. Right, the dense scan: close
-# rings, cars, tree trunks with crowns, house fronts, and the shadows that they throw.*
+# six thin rings on the ground with wide empty gaps, a few dashes where poles and trees are. Right, the dense scan:
+# close rings, cars, tree trunks with crowns, house fronts, and the shadows that they throw.*
 
 # %% [markdown]
 # ## 5. Between the beams
