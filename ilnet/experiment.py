@@ -73,10 +73,10 @@ class Study:
             train.train(name, self.preset, folder, seed=seed, archive=archive, **arguments)
         return file
 
-    def compare(self, files: dict[str, str | Path], sizes: Sequence[tuple[int, int]] = SIZES) -> list[dict[str, Any]]:
-        """Measures models, by the names their rows shall bear, on the test towns at several sizes."""
+    def compare(self, files: dict[str, str | Path], sizes: Sequence[tuple[int, int]] = ()) -> list[dict[str, Any]]:
+        """Measures models, by the names their rows shall bear, on the test towns; at all `SIZES` unless told."""
         rows = []
-        for size in sizes:
+        for size in sizes or SIZES:
             output = evaluate.INPUT.resize(*size)
             pairs = [pair for town in towns.TEST for pair in evaluate.town_pairs(town, self.scans, output)]
             rows += evaluate.evaluate({label: models.load(file) for label, file in files.items()}, pairs)
@@ -135,15 +135,7 @@ def convergence(study: Study) -> None:
     for name in ("liif", "iln"):
         for seed in range(study.seeds):
             folder = study.trained(f"{name}-{seed}", name, seed, probe=pairs).parent
-            for log in sorted(folder.glob(f"{name}/from-step-*/metrics.csv")):
-                with open(log) as file:
-                    found = [row for row in csv.DictReader(file) if row.get("test/iou")]
-                for row in found:
-                    figures = {key: float(row[f"test/{key}"]) for key in ("mae", "iou", "floating")}
-                    seconds = float(row["seconds"])
-                    rows.append(
-                        {"model": name, "seed": seed, "step": int(row["step"]) + 1, "seconds": seconds} | figures
-                    )
+            rows += [{"model": name, "seed": seed, **row} for row in _probed(folder / name)]
     study.write("convergence", rows)
     figure = Figure(figsize=(10, 3.2), layout="constrained")
     for axis, (x, y) in zip(figure.subplots(1, 3), (("step", "iou"), ("seconds", "iou"), ("step", "mae")), strict=True):
@@ -157,6 +149,19 @@ def convergence(study: Study) -> None:
         axis.set_ylabel({"iou": "IoU", "mae": "MAE [m]"}[y])
     axis.legend()
     figure.savefig(study.out / "convergence.png", dpi=120)
+
+
+def _probed(folder: Path) -> list[dict[str, Any]]:
+    """The test figures that a training logged, each step once, though it was interrupted."""
+    found: dict[int, dict[str, Any]] = {}
+    for log in folder.glob("from-step-*/metrics.csv"):
+        with open(log, newline="") as file:
+            for row in csv.DictReader(file):
+                if row.get("test/iou"):
+                    step = int(row["step"]) + 1
+                    figures = {key: float(row[f"test/{key}"]) for key in ("mae", "iou", "floating")}
+                    found.setdefault(step, {"step": step, "seconds": float(row["seconds"]), **figures})
+    return [found[step] for step in sorted(found)]
 
 
 def steps_to_reach(rows: Sequence[dict[str, Any]], share: float = 0.1) -> dict[str, float]:

@@ -136,10 +136,12 @@ class Training(lightning.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Logs the means over all scans of all processes."""
-        self.log("seconds", time.monotonic() - self.begun)
+        training = self.trainer.state.fn == "fit"  # and not the last word on the weights that were chosen
+        self.log("seconds", time.monotonic() - self.begun, logger=training)
         for kind, figures in self.figures.items():
             for name, value in figures.compute().items():  # type: ignore[operator]
-                self.log(f"{kind}/{name}", value.float(), prog_bar=kind == "val" and name in ("mae", "iou"))
+                shown = kind == "val" and name in ("mae", "iou")
+                self.log(f"{kind}/{name}", value.float(), prog_bar=shown, logger=training)
             figures.reset()  # type: ignore[operator]
 
     def configure_optimizers(self) -> Any:
@@ -288,8 +290,9 @@ def _processes(number: int) -> dict[str, Any]:
 
 
 def _validate(trainer: lightning.Trainer, training: Training, scans: DataLoader[tuple[str, int]]) -> dict[str, float]:
-    found = trainer.validate(training, scans, verbose=False)[0]
-    return {key: round(value, 4) for key, value in found.items() if key != "seconds"}
+    trainer.validate(training, scans, verbose=False)
+    found = trainer.callback_metrics
+    return {key: round(float(value), 4) for key, value in found.items() if key.partition("/")[0] in training.pairs}
 
 
 def _steps_done(checkpoint: Path, run: dict[str, Any]) -> int:

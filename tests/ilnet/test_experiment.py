@@ -1,0 +1,104 @@
+import csv
+import math
+
+import pytest
+
+from ilnet import evaluate, experiment, metrics, train
+from ilnet.sensor import preset
+from ilnet.simulate import pose, simulate
+
+
+@pytest.fixture
+def study(tmp_path, monkeypatch, yard, quiet_street):
+    """Experiments in the yard, with networks and budgets of a size for tests."""
+    street = quiet_street(yard, [[3, 0, 0]])
+
+    def pairs(town, count, output):
+        return [tuple(simulate(yard, sensor, pose((3.0, 0.0, 1.8))) for sensor in (evaluate.INPUT, output))] * count
+
+    monkeypatch.setattr(train.data, "street", lambda *args: street)
+    monkeypatch.setattr(evaluate, "town_pairs", pairs)
+    monkeypatch.setattr(train, "HELD_OUT", {"town01": 1})
+    monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
+    monkeypatch.setattr(train, "VALIDATE_EVERY", (2, 2))
+    monkeypatch.setattr(experiment, "SIZES", ((16, 256), (32, 512)))
+    tables = experiment.PAPER["64x1024"], experiment.PAPER["128x2048"]
+    monkeypatch.setattr(experiment, "PAPER", dict(zip(("16x256", "32x512"), tables, strict=True)))
+    monkeypatch.setattr(experiment.plot, "point_clouds", lambda scans, path, reach: path.write_bytes(b"drawn"))
+    size = train.Preset(steps=4, blocks=1, crops=2, columns=32, queries=64, towns=("town01",))
+    monkeypatch.setitem(train.PRESETS, "tiny", size)
+    return experiment.Study("tiny", tmp_path / "out", scans=1, seeds=2)
+
+
+def rows(study, name):
+    with open(study.out / f"{name}.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_table_has_every_method_at_every_size_beside_the_paper(study):
+    experiment.table(study)
+    found = rows(study, "table")
+    assert [(row["size"], row["model"]) for row in found] == [
+        (size, name)
+        for size in ("16x256", "32x512")
+        for name in ("nearest", "bilinear", "bilinear-inverse", "liif", "iln", "iln-prior")
+    ]
+    assert all(0 < float(row["iou"]) <= 1 for row in found if row["model"] != "liif")
+    assert {path.name for path in study.out.glob("*.png")} == {"table.png", "points-town07.png", "points-town10.png"}
+    page = experiment.results(study).read_text()
+    assert "| liif | 16x256 | 2 |" in page
+    assert "| 1.558 | 0.258 |" in page  # what the paper reports for LIIF at 64x1024
+
+
+def test_what_was_trained_is_not_trained_again(study, monkeypatch):
+    file = study.trained("iln-0", "iln")
+    before = file.read_bytes()
+    monkeypatch.setattr(train, "train", lambda *args, **kwargs: pytest.fail("trained again"))
+    assert study.trained("iln-0", "iln") == file
+    assert file.read_bytes() == before
+
+
+def test_convergence_follows_test_figures_over_seeds(study):
+    experiment.convergence(study)
+    found = rows(study, "convergence")
+    assert {(row["model"], row["seed"], row["step"]) for row in found} == {
+        (name, seed, step) for name in ("liif", "iln") for seed in "01" for step in "24"
+    }
+    assert all(float(row["seconds"]) > 0 for row in found)
+    assert "times as many" in experiment.results(study).read_text()
+
+
+def test_steps_to_reach_by_hand():
+    curves = {"iln": {10: 0.30, 50: 0.40, 100: 0.41}, "liif": {10: 0.10, 50: 0.29, 100: 0.33}}
+    made = [
+        {"model": name, "step": step, "iou": iou + shift}
+        for name, curve in curves.items()
+        for step, iou in curve.items()
+        for shift in (-0.01, 0.01)
+    ]
+    reached = experiment.steps_to_reach(made)
+    assert reached == {"iou": pytest.approx(0.30), "iln_steps": 10, "liif_steps": 100, "ratio": 10}
+    never = [{**row, "iou": row["iou"] / 2} if row["model"] == "liif" else row for row in made]
+    assert math.isinf(experiment.steps_to_reach(never)["ratio"])
+
+
+def test_ablations_and_measured_scans(study, tmp_path, yard):
+    from ilnet import scan
+
+    frame = tmp_path / "frame.npz"
+    scan.write(frame, simulate(yard, preset("os1-32").resize(32, 256), pose((3.0, 0.0, 1.8))))
+    study = experiment.Study("tiny", study.out, 1, 1, measured=(frame,))
+    for name in ("attention", "prior", "real"):
+        experiment.EXPERIMENTS[name](study)
+        assert (study.out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+    assert [row["depth"] for row in rows(study, "attention")[::2]] == ["0", "1", "2", "4"]
+    assert {row["prior"] for row in rows(study, "prior")} == {"none", "bilinear", "perspective"}
+    assert {row["beams"] for row in rows(study, "real")} == {"8", "16"}
+    assert set(metrics.FIGURES[:5]) < set(rows(study, "real")[0])
+
+
+def test_what_is_missing_is_named(study):
+    with pytest.raises(ValueError, match=r"stored images are missing.*--data DIR"):
+        experiment.rays(study)
+    with pytest.raises(ValueError, match=r"no measured scans are named.*--measured FILE"):
+        experiment.real(study)
