@@ -70,8 +70,7 @@ class Mesh:
         vertices: (V, 3) floating-point, metres, in any frame. They are copied; float64 keeps its precision far from the
             frame's origin (georeferenced meshes).
         triangles: (F, 3) integer, numbers of the vertices.
-        device: Where the mesh is kept and the rays are cast; a torch device or its name. On CUDA, keep the mesh until
-            the rays have been cast: its memory is not torch's, which would wait for the stream.
+        device: Where the mesh is kept and the rays are cast; a torch device or its name.
 
     Raises:
         TypeError: If an argument is not an array of numbers of the right kind.
@@ -112,6 +111,11 @@ class Mesh:
         self._middle = ((points.amin(0) + points.amax(0)).double() / 2).round().to(self.device)
         self._vertices = (points.to(self.device).double() - self._middle).float()
         self._triangles = faces.to(self.device, torch.int32).contiguous()
+
+    def __del__(self) -> None:
+        # Warp frees a tree at once, though rays may still be on their way through it.
+        if "_tree" in self.__dict__ and self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
 
     # Made when they are first asked for: few meshes need both.
 

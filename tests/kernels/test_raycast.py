@@ -162,6 +162,19 @@ def test_shapes_broadcast_and_no_rays(device):
     assert mesh.cast(torch.ones(0, 3, device=device), torch.ones(3, device=device), 9.0).range.shape == (0,)
 
 
+def test_a_mesh_may_go_before_its_rays_have_come_home(device):
+    """As the traffic of one scan does: on CUDA its rays are still on their way when it is dropped."""
+    vertices, triangles = soup(2000)
+    directions = unit_vectors(200_000).to(device)
+    origin = torch.zeros(3, device=device)
+    kept = Mesh(vertices, triangles, device)
+    expected = kept.cast(origin, directions, 50.0).range
+    for _ in range(5):
+        dropped = Mesh(vertices, triangles, device).cast(origin, directions, 50.0).range
+        Mesh(vertices + 100.0, triangles, device).cast(origin, directions[:10], 50.0)  # takes the memory that is free
+        assert torch.equal(dropped, expected)
+
+
 def bad_meshes():
     vertices, triangles = plane()
     torn = vertices.clone()
