@@ -76,6 +76,13 @@ def nearest(found: Sequence[torch.Tensor]) -> torch.Tensor:
     return ranges
 
 
+def _meshes(world: World) -> Sequence[Mesh]:
+    meshes = [world] if isinstance(world, Mesh) else world
+    if not meshes:
+        raise ValueError("world is empty; it should be a mesh or several")
+    return meshes
+
+
 def ranges(world: World, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
     """Casts every ray of a sensor at each of several poses, by the engine that is faster for each mesh.
 
@@ -86,9 +93,11 @@ def ranges(world: World, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
 
     Returns:
         (..., H, W) float32 metres on the meshes' device; 0 where nothing is met between minimum and maximum range.
+
+    Raises:
+        ValueError: If there is no mesh, or a pose is not finite.
     """
-    meshes = [world] if isinstance(world, Mesh) else world
-    found = nearest([_images(mesh, sensor, poses.view(-1, 4, 4)) for mesh in meshes])
+    found = nearest([_images(mesh, sensor, poses.reshape(-1, 4, 4)) for mesh in _meshes(world)])
     return found.where(found >= sensor.min_range, 0.0).view(*poses.shape[:-2], *sensor.shape)
 
 
@@ -117,8 +126,10 @@ def simulate(world: World, sensor: Sensor, pose: torch.Tensor, effects: Effects 
 
     Returns:
         The scan; 0 where nothing is met between the sensor's minimum and maximum range.
+
+    Raises:
+        ValueError: If there is no mesh, a pose is not finite, or the effects do not fit the sensor.
     """
     if effects is None:
         return Scan(ranges(world, sensor, pose), sensor)
-    meshes = [world] if isinstance(world, Mesh) else world
-    return simulate_with(effects, meshes, sensor, pose, torch.Generator().manual_seed(seed))
+    return simulate_with(effects, _meshes(world), sensor, pose, torch.Generator().manual_seed(seed))

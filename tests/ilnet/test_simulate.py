@@ -103,6 +103,7 @@ def test_many_poses_are_cast_in_one_call(yard_on, size, device):
         assert torch.equal(image, simulate(mesh, sensor, one).ranges)
     assert ranges(mesh, sensor, poses.view(3, 1, 4, 4)).shape == (3, 1, *sensor.shape)
     assert ranges(mesh, sensor, poses[:0]).shape == (0, *sensor.shape)
+    assert torch.equal(ranges(mesh, sensor, poses.mT.contiguous().mT), many)  # in any order of memory
 
 
 def test_the_engine_follows_the_work(yard):
@@ -157,3 +158,12 @@ def test_both_engines_see_the_same_in_other_meshes(shared, name):
     file = shared / "data" / "meshes" / f"{name}.ply"
     positions = json.loads(file.with_name(f"{name}_positions.json").read_text())["positions"]
     compare_engines(Mesh(*meshes.read(file)), positions[:2])
+
+
+def test_what_cannot_be_cast_is_named(yard):
+    sensor = preset("paper-16x1024")
+    for effects in (None, Effects(range_noise=0.1)):
+        with pytest.raises(ValueError, match="world is empty; it should be a mesh or several"):
+            simulate([], sensor, pose((0.0, 0.0, 1.8)), effects)
+    with pytest.raises(ValueError, match="finite"):
+        simulate(yard, sensor, pose((math.nan, 0.0, 1.8)))
