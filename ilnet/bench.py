@@ -35,6 +35,7 @@ from kernels import area_blend, gather_blend, neighbour_attention, project_pixel
 __all__ = ["SECTIONS", "Row", "bench", "peak_memory", "table"]
 
 INPUT, OUTPUT, LARGE = "paper-16x1024", "paper-128x2048", (256, 4096)
+TOWN = "town01"
 # Queries of an op: those of a frame, and a quarter of it where each has 4 tokens of 64 numbers.
 BLENDS, TOKENS = 262_144, 65_536
 TRAIN_SCANS, TRAIN_QUERIES = 4, 16_384
@@ -324,7 +325,7 @@ def train() -> Iterator[Row]:
 def _draw_batches(model: models.ILN, optimizer: torch.optim.Optimizer, device: torch.device) -> Iterator[Row]:
     """What it takes to draw a batch of continuous rays, beside the step of training that it is for."""
     size = training.PRESETS["tiny"]
-    street = data.street(demo.TOWN, 0, device)
+    street = data.street(TOWN, 0, device)
     rays = data.ContinuousRays([street], preset(INPUT), size.crops, size.columns, size.queries, seed=0)
     batches = iter(rays)
     batch = next(batches)
@@ -356,7 +357,7 @@ def _draw_batches(model: models.ILN, optimizer: torch.optim.Optimizer, device: t
 def rays() -> Iterator[Row]:
     """Scans cast in a town, beside Open3D's and embreex's rays where these are installed."""
     device = best_device()
-    street = data.street(demo.TOWN, 0, device)
+    street = data.street(TOWN, 0, device)
     poses = torch.stack([street.pose(number) for number in range(0, 100 * SCANS[device.type], 100)])
     for sensor in (preset("paper-64x1024"), preset(OUTPUT), preset(OUTPUT).resize(*LARGE)):
         size = "{} x {}x{}, {:.0f}k triangles".format(len(poses), *sensor.shape, len(street.town.triangles) / 1000)

@@ -85,15 +85,26 @@ def demo(
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps, instead of the preset's.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of weights and rays.")
 @click.option("--data", type=Path, metavar="DIR", help="Learn from stored images: an archive or a tree of .rimg files.")
+@click.option("--size", type=_Size(), help="Of the stored images to learn from; 128x2048 unless told.")
 @click.option("--out", type=Path, default=Path("runs"), show_default=True, help="Folder for weights, figures, logs.")
-def train(model: str, preset: str, steps: int | None, seed: int, data: Path | None, out: Path) -> None:
+def train(
+    model: str,
+    preset: str,
+    steps: int | None,
+    seed: int,
+    data: Path | None,
+    size: tuple[int, int] | None,
+    out: Path,
+) -> None:
     """Train MODEL on rays cast at continuous directions; goes on where an interrupted run in --out stopped.
 
     `torchrun --nproc-per-node N -m ilnet train MODEL` shares each batch among N processes or GPUs.
     """
     from ilnet import train as training
 
-    figures = training.train(model, preset, out, steps, seed, data)
+    if size and not data:
+        raise click.UsageError("--size goes with --data DIR")
+    figures = training.train(model, preset, out, steps, seed, data, size or training.TARGET_SIZE)
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
 
 
@@ -314,7 +325,9 @@ def towns(names: tuple[str, ...], out: Path) -> None:
 @click.argument(
     "names", nargs=-1, type=click.Choice(["table", "convergence", "attention", "prior", "rays", "real", "all"])
 )
-@click.option("--preset", default="small", show_default=True, help="Of each training.")
+@click.option(
+    "--preset", help="Of each training; small unless told, and table and real then take the networks that ship."
+)
 @click.option("--out", type=Path, default=Path("runs/experiments"), show_default=True, help="Folder for all there is.")
 @click.option("--scans", type=click.IntRange(min=1), default=20, show_default=True, help="From each test town.")
 @click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, help="Trainings behind each band.")
@@ -322,7 +335,7 @@ def towns(names: tuple[str, ...], out: Path) -> None:
 @click.option("--measured", type=Path, multiple=True, metavar="FILE", help="A measured scan; may be repeated.")
 def experiment(
     names: tuple[str, ...],
-    preset: str,
+    preset: str | None,
     out: Path,
     scans: int,
     seeds: int,

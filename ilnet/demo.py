@@ -13,9 +13,9 @@ __all__ = ["METHODS", "OUTPUT", "TOWN", "demo", "from_town"]
 
 METHODS = ("nearest", "bilinear", "bilinear-inverse", "iln", "iln-prior")
 OUTPUT = preset("paper-128x2048")
-TOWN = "town01"
-# A waypoint of the town with seed 0, in which no network was trained.
-_WAYPOINT = 400
+# No network was trained here, nor any choice made.
+TOWN = "town10"
+_WAYPOINT = 1400
 
 
 def from_town() -> tuple[Scan, Scan]:

@@ -5,9 +5,10 @@ share what they have in common. Test scans come from the towns 07 and 10, in whi
 """
 
 import csv
+import json
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,8 @@ class Study:
     """What experiments share.
 
     Attributes:
-        preset: Of each training, one of `train.PRESETS`.
+        preset: Of each training, one of `train.PRESETS`; where None, trainings are `small`, and the networks that ship
+            with the package stand for those that are compared with other methods.
         out: Folder for weights, numbers, figures.
         scans: Test scans from each test town.
         seeds: How often a training is repeated where its spread is shown.
@@ -58,7 +60,7 @@ class Study:
         measured: Files of measured scans.
     """
 
-    preset: str
+    preset: str | None
     out: Path
     scans: int = 20
     seeds: int = 3
@@ -70,8 +72,12 @@ class Study:
         folder = self.out / "weights" / label
         file = folder / f"{name}.safetensors"
         if not file.exists():
-            train.train(name, self.preset, folder, seed=seed, archive=archive, **arguments)
+            train.train(name, self.preset or "small", folder, seed=seed, archive=archive, **arguments)
         return file
+
+    def networks(self) -> dict[str, str | Path]:
+        """The networks that are compared with other methods."""
+        return {name: self.trained(name, name) if self.preset else name for name in ("liif", "iln", "iln-prior")}
 
     def compare(self, files: dict[str, str | Path], sizes: Sequence[tuple[int, int]] = ()) -> list[dict[str, Any]]:
         """Measures models, by the names their rows shall bear, on the test towns; at all `SIZES` unless told."""
@@ -83,8 +89,12 @@ class Study:
         return rows
 
     def write(self, name: str, rows: Sequence[dict[str, Any]]) -> None:
-        """Writes rows of one kind as NAME.csv."""
+        """Writes rows of one kind as NAME.csv, and in about.json what they were made with."""
         self.out.mkdir(parents=True, exist_ok=True)
+        shipped = self.preset is None and name in ("table", "real")
+        networks = "the networks that ship" if shipped else f"networks trained with preset {self.preset or 'small'}"
+        about = _about(self.out) | {name: {"networks": networks}}
+        (self.out / "about.json").write_text(json.dumps(about, indent=1) + "\n")
         with open(self.out / f"{name}.csv", "w", newline="") as file:
             writer = csv.DictWriter(file, rows[0], lineterminator="\n")
             writer.writeheader()
@@ -96,13 +106,11 @@ class Study:
 def table(study: Study) -> None:
     """The paper's Table II: all methods at three sizes."""
     files: dict[str, str | Path] = {name: name for name in ("nearest", "bilinear", "bilinear-inverse")}
-    files |= {name: study.trained(name, name) for name in ("liif", "iln", "iln-prior")}
+    files |= study.networks()
     rows = study.compare(files)
     if study.archive:
         for size in SIZES[:2]:  # the third takes more memory than most have
-            times = [target // source for target, source in zip(size, evaluate.INPUT.shape, strict=True)]
-            label = f"lidar-sr-{size[0]}"
-            file = study.trained(label, "lidar-sr", archive=study.archive, rows=times[0], columns=times[1])
+            file = study.trained(f"lidar-sr-{size[0]}", "lidar-sr", archive=study.archive, target=size)
             rows += study.compare({"lidar-sr": file}, [size])
     study.write("table", rows)
     figure = Figure(figsize=(10, 3.2), layout="constrained")
@@ -172,11 +180,11 @@ def steps_to_reach(rows: Sequence[dict[str, Any]], share: float = 0.1) -> dict[s
     """
     curves: dict[str, dict[int, float]] = {}
     for name in ("liif", "iln"):
-        steps = sorted({row["step"] for row in rows if row["model"] == name})
-        curves[name] = {
-            step: float(np.mean([row["iou"] for row in rows if row["model"] == name and row["step"] == step]))
-            for step in steps
-        }
+        at: dict[int, list[float]] = {}
+        for row in rows:
+            if row["model"] == name:
+                at.setdefault(int(row["step"]), []).append(float(row["iou"]))
+        curves[name] = {step: float(np.mean(at[step])) for step in sorted(at)}
     iln_steps = min(step for step in curves["iln"] if step >= share * max(curves["iln"]))
     iou = curves["iln"][iln_steps]
     liif_steps = min((step for step, value in curves["liif"].items() if value >= iou), default=math.inf)
@@ -224,7 +232,7 @@ def rays(study: Study) -> None:
     if study.archive is None:
         raise ValueError(
             f"stored images are missing: make some with `python -m ilnet simulate --towns {','.join(towns.TRAIN)} "
-            f"--scans 2000 --sizes {train.INPUT_SIZE},{train.TARGET_SIZE} --out DIR`, and name them with --data DIR"
+            "--scans 2000 --sizes 16x1024,64x1024,128x2048 --out DIR`, and name them with --data DIR"
         )
     rows = []
     for learns_from, archive in (("continuous", None), ("stored", study.archive)):
@@ -255,7 +263,7 @@ def real(study: Study) -> None:
     if not study.measured:
         raise ValueError("no measured scans are named: give some with --measured FILE, such as frames of your sensor")
     files: dict[str, str | Path] = {name: name for name in ("bilinear", "bilinear-inverse")}
-    files |= {name: study.trained(name, name) for name in ("liif", "iln", "iln-prior")}
+    files |= study.networks()
     loaded = {label: models.load(file) for label, file in files.items()}
     rows = []
     for path in study.measured:
@@ -290,26 +298,62 @@ EXPERIMENTS: dict[str, Callable[[Study], None]] = {
 
 def results(study: Study) -> Path:
     """Writes RESULTS.md: all that experiments left in the folder so far, as tables and figures."""
-    lines = ["# Results", "", f"Preset `{study.preset}`; test scans from {study.scans} waypoints of each test town."]
-    for name, experiment in EXPERIMENTS.items():
-        file = study.out / f"{name}.csv"
-        if not file.exists():
-            continue
-        with open(file, newline="") as text:
-            rows = list(csv.DictReader(text))
-        lines += ["", f"## {name}", "", (experiment.__doc__ or "").strip(), "", f"![{name}]({name}.png)", ""]
-        if name == "convergence":
-            numbers = [{**row, "step": int(row["step"]), "iou": float(row["iou"])} for row in rows]
-            reached = steps_to_reach(numbers)
-            lines += [
-                f"ILN has IoU {reached['iou']:.3f} after {reached['iln_steps']} steps; LIIF after "
-                f"{reached['liif_steps']}: {reached['ratio']:.1f} times as many."
-            ]
-        else:
-            lines += _markdown(_beside_the_paper(rows) if name == "table" else rows)
+    about = _about(study.out)
+    done = {name: _read(study.out / f"{name}.csv") for name in EXPERIMENTS if name in about}
+    lines = ["# Results", "", "Ratios of figures on the test towns, and of IoU on measured scans:", ""]
+    lines += _markdown(ratios(done))
+    for name, rows in done.items():
+        lines += ["", f"## {name}", "", (EXPERIMENTS[name].__doc__ or "").strip(), ""]
+        lines += [f"Made with {about[name]['networks']}.", "", f"![{name}]({name}.png)", ""]
+        lines += _markdown(_beside_the_paper(rows) if name == "table" else rows) if name != "convergence" else []
+        if name == "table":
+            lines += ["", *(f"![The same crop by every method, {town}](points-{town}.png)" for town in towns.TEST)]
     page = study.out / "RESULTS.md"
-    page.write_text("\n".join(lines) + "\n")
+    page.write_text("\n".join(lines).rstrip() + "\n")
     return page
+
+
+def ratios(done: Mapping[str, Sequence[dict[str, Any]]]) -> list[dict[str, str]]:
+    """What the experiments are about: one row for each ratio, with the paper's beside ours.
+
+    Args:
+        done: Rows of the experiments `table`, `convergence` and `real`, by name, as far as they were run.
+    """
+    found: list[dict[str, str]] = []
+
+    def add(figure: str, one: dict[str, Any], other: dict[str, Any], key: str, paper: float | None = None) -> None:
+        ours = f"{float(one[key]) / float(other[key]):.2f}" if float(other[key]) else "over 0"
+        found.append({"figure": figure, "the paper": f"{paper:.2f}" if paper else "", "ours": ours})
+
+    table = {(row["model"], row["size"]): row for row in done.get("table", ())}
+    for key, words in (("iou", "IoU"), ("mae", "MAE")):
+        column = {"mae": 0, "iou": 1}[key]
+        for one, other in (("iln", "liif"), ("iln", "bilinear"), ("iln-prior", "bilinear"), ("iln-prior", "iln")):
+            for size, paper in PAPER.items():
+                if {(one, size), (other, size)} <= table.keys():
+                    theirs = paper[one][column] / paper[other][column] if {one, other} <= paper.keys() else None
+                    add(f"{words} of {one} over {other}, {size}", table[one, size], table[other, size], key, theirs)
+    if "convergence" in done:
+        reached = steps_to_reach(done["convergence"])
+        figure = f"steps of liif to the IoU {reached['iou']:.3f} that iln has after {reached['iln_steps']}, over those"
+        ours = "never in its budget" if math.isinf(reached["ratio"]) else f"{reached['ratio']:.1f}"
+        found.append({"figure": figure, "the paper": "much more", "ours": ours})
+    real = {(row["model"], row["scan"], row["beams"], row["size"]): row for row in done.get("real", ())}
+    for model, *case in real:
+        if model == "iln-prior":
+            figure = f"IoU of iln-prior over bilinear, {case[0]}, {case[1]} beams -> {case[2]}"
+            add(figure, real[model, *case], real["bilinear", *case], "iou")
+    return found
+
+
+def _about(folder: Path) -> dict[str, Any]:
+    file = folder / "about.json"
+    return dict(json.loads(file.read_text())) if file.exists() else {}
+
+
+def _read(file: Path) -> list[dict[str, Any]]:
+    with open(file, newline="") as text:
+        return list(csv.DictReader(text))
 
 
 def _beside_the_paper(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -322,6 +366,8 @@ def _beside_the_paper(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _markdown(rows: Sequence[dict[str, Any]]) -> list[str]:
+    if not rows:
+        return []
     head = list(rows[0])
     return [
         "| " + " | ".join(map(str, line)) + " |" for line in (head, ["---"] * len(head), *(r.values() for r in rows))

@@ -4,6 +4,7 @@ What is learned from are rays cast at continuous directions while training goes 
 images stored on disk. Under `torchrun` several processes share each batch.
 """
 
+import math
 import multiprocessing
 import os
 import time
@@ -29,8 +30,8 @@ Pair = tuple[Scan, Scan]
 
 INPUT = "paper-16x1024"
 OUTPUT = "paper-64x1024"
-# Of stored images: what is seen, and what pixels are taken from.
-INPUT_SIZE, TARGET_SIZE = "16x1024", "128x2048"
+# Of the stored images that pixels are taken from, unless told.
+TARGET_SIZE = 128, 2048
 # What the best weights are chosen by: scans of towns that no training sees. (Seed 0, the default, is that of training.)
 HELD_OUT = {"town01": 1, "town03": 1, "town05": 1}
 HELD_OUT_SCANS = 4
@@ -57,11 +58,11 @@ class Preset:
     """Highest learning rate."""
     blocks: int = 16
     """Residual blocks of the encoder."""
-    crops: int = 16
+    crops: int = 8
     """Crops in a step."""
-    columns: int = 128
+    columns: int = 64
     """Columns of a crop."""
-    queries: int = 2048
+    queries: int = 1024
     """Rays per crop."""
     dropout: float = 0.0
     """In the attention blocks."""
@@ -70,19 +71,21 @@ class Preset:
 
     def arguments(self, name: str) -> dict[str, Any]:
         """What differs from the own defaults of the model called `name`."""
-        return {"blocks": self.blocks} | ({} if name == "liif" else {"dropout": self.dropout})
+        own: dict[str, dict[str, Any]] = {"liif": {"blocks": self.blocks}, "lidar-sr": {}}
+        return own.get(name, {"blocks": self.blocks, "dropout": self.dropout})
 
 
 PRESETS = {
     # As the authors' code does it, on stored images; days on a GPU.
     "paper": Preset(
-        epochs=1000, halve_after=(200, 400, 600, 800), rate=1e-4, columns=1024, queries=16_384, dropout=0.1
+        epochs=1000, halve_after=(200, 400, 600, 800), rate=1e-4, crops=16, columns=1024, queries=16_384, dropout=0.1
     ),
-    # Full-size networks: an hour and a half, and twenty minutes, on two cores.
-    "laptop": Preset(steps=5000),
-    "small": Preset(steps=1000),
-    # Minutes, for the course.
-    "tiny": Preset(steps=150, blocks=4, towns=("town01", "town02")),
+    # Full-size networks: an hour and a half, and ten minutes, on two cores. Many small steps get further in that time
+    # than few large ones.
+    "laptop": Preset(steps=20_000),
+    "small": Preset(steps=2000),
+    # A minute or two, for the course.
+    "tiny": Preset(steps=400, blocks=4, towns=("town01", "town02")),
 }
 
 
@@ -100,7 +103,7 @@ class Training(lightning.LightningModule):
 
     def __init__(
         self,
-        model: models.ILN | models.LIIF,
+        model: models.Model,
         held_out: Sequence[Pair],
         rate: float,
         halve_after: Sequence[int] = (),
@@ -114,8 +117,12 @@ class Training(lightning.LightningModule):
         self.begun = time.monotonic()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Lets `train` refuse to go on with a run of another kind."""
-        checkpoint["run"] = self.run
+        """Lets `train` refuse to go on with a run of another kind, and count its time."""
+        checkpoint["run"], checkpoint["seconds"] = self.run, time.monotonic() - self.begun
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Counts the time of the run that goes on."""
+        self.begun = time.monotonic() - checkpoint["seconds"]
 
     def training_step(self, batch: data.Batch, index: int) -> torch.Tensor:
         """L1 between ranges scaled to [-1, 1]."""
@@ -132,7 +139,8 @@ class Training(lightning.LightningModule):
         """Measures one scan: of which kind, and its number."""
         kind, number = place
         scan, truth = self.pairs[kind][number]
-        self.figures[kind].update(self.model.ranges(scan, truth.sensor).float(), truth)  # type: ignore[operator]
+        with torch.autocast(self.device.type, enabled=False):  # as `evaluate` measures
+            self.figures[kind].update(self.model.ranges(scan, truth.sensor), truth)  # type: ignore[operator]
 
     def on_validation_epoch_end(self) -> None:
         """Logs the means over all scans of all processes."""
@@ -163,6 +171,7 @@ def train(
     steps: int | None = None,
     seed: int = 0,
     archive: Path | None = None,
+    target: tuple[int, int] = TARGET_SIZE,
     probe: Sequence[Pair] = (),
     **arguments: Any,
 ) -> dict[str, float]:
@@ -177,7 +186,9 @@ def train(
             start, `from-step-N/` with metrics.csv and what TensorBoard reads.
         steps: Overrides the preset's.
         seed: Of the initial weights and the rays, 0 or more.
-        archive: Stored images to learn from instead of continuous rays; see `data.open_archive`.
+        archive: Stored images to learn from instead of continuous rays; see `data.open_archive`. LiDAR-SR has no other
+            way to learn.
+        target: Size (rows, columns) of the stored images to learn from; the one that LiDAR-SR predicts.
         probe: Pairs of an input scan and the scan to be predicted, whose figures are logged as `test/...` and decide
             nothing.
         **arguments: Override the model's.
@@ -194,16 +205,19 @@ def train(
     if name not in models.TRAINABLE:
         raise ValueError(f"model {name!r} cannot be trained; these can: {', '.join(models.TRAINABLE)}")
     size = PRESETS[preset_name]
-    if size.epochs and archive is None:
+    source = preset(INPUT).shape
+    if archive is None and (size.epochs or name == "lidar-sr"):
         raise ValueError(
-            f"preset {preset_name} learns from stored images: make some with `python -m ilnet simulate --sizes "
-            f"{INPUT_SIZE},{TARGET_SIZE} --out DIR`, and name them with --data DIR"
+            f"{name} with preset {preset_name} learns from stored images: make some with `python -m ilnet simulate "
+            f"--sizes {_words(source)},{_words(target)} --out DIR`, and name them with --data DIR"
         )
+    if name == "lidar-sr":
+        arguments = {"rows": target[0] // source[0], "columns": target[1] // source[1], **arguments}
     stored = None if archive is None else data.open_archive(archive)
     per_epoch = -(-len(stored) // size.crops) if stored else 0
     steps = steps or size.steps or size.epochs * per_epoch
     arguments = {**size.arguments(name), **arguments}
-    learns_from = str(archive) if archive else "continuous rays"
+    learns_from = f"{_words(target)} of {archive}" if archive else "continuous rays"
     run = {"preset": preset_name, "steps": steps, "seed": seed, "data": learns_from, **arguments}
     folder = out / name
     start = _steps_done(folder / "last.ckpt", run)
@@ -212,13 +226,13 @@ def train(
     number, processes = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     lightning.seed_everything(seed, verbose=False)
     model = models.create(name, **arguments)
-    assert isinstance(model, models.ILN | models.LIIF)
-    samples = _samples(size, stored, seed, start, (number, processes), device)
+    samples = _samples(name, size, stored, target, seed, start, (number, processes), device)
+    output = preset(INPUT).resize(*target) if name == "lidar-sr" else preset(OUTPUT)
     held_out: list[Pair] = [
         (pair[0], pair[1])
         for town, held_out_seed in HELD_OUT.items()
         for pair in data.held_out_scans(
-            data.street(town, held_out_seed, device), HELD_OUT_SCANS, [preset(INPUT), preset(OUTPUT)]
+            data.street(town, held_out_seed, device), HELD_OUT_SCANS, [preset(INPUT), output]
         )
     ]
     training = Training(model, held_out, size.rate, [epoch * per_epoch for epoch in size.halve_after], run, probe)
@@ -257,8 +271,10 @@ def train(
 
 
 def _samples(
+    name: str,
     size: Preset,
     stored: data.Archive | data.RangeImageTree | None,
+    target: tuple[int, int],
     seed: int,
     start: int,
     part: tuple[int, int],
@@ -267,11 +283,15 @@ def _samples(
     if stored is None:
         streets = [data.street(town, 0, device) for town in size.towns]
         return data.ContinuousRays(streets, preset(INPUT), size.crops, size.columns, size.queries, seed, start, part)
-    # As many columns and as many queries as the crops have.
-    scans = size.crops * size.columns // preset(INPUT).shape[1]
-    return data.StoredImages(
-        stored, INPUT_SIZE, TARGET_SIZE, scans, size.crops * size.queries // scans, seed, start, part
-    )
+    source = preset(INPUT).shape
+    # As many columns and as many queries as the crops have, in whole scans. What predicts whole images learns from all.
+    scans = max(1, size.crops * size.columns // source[1])
+    queries = math.prod(target) if name == "lidar-sr" else size.crops * size.queries // scans
+    return data.StoredImages(stored, _words(source), _words(target), scans, queries, seed, start, part)
+
+
+def _words(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
 
 
 def _workers(device: torch.device) -> dict[str, Any]:

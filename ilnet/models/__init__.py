@@ -43,7 +43,7 @@ _MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
     "iln-prior": (ILN, {"prior": "perspective"}),
 }
 NAMES = tuple(_MODELS)
-TRAINABLE = tuple(name for name, (kind, _) in _MODELS.items() if kind in (ILN, LIIF))
+TRAINABLE = tuple(name for name, (kind, _) in _MODELS.items() if kind not in (Nearest, Bilinear))
 
 _SHIPPED = Path(__file__).parents[1] / "weights"
 
@@ -94,12 +94,11 @@ def load(name: str | Path) -> Model:
         FileNotFoundError: If there is no such file.
         ValueError: If it is neither a name nor a file of weights.
     """
-    if name in NAMES and _MODELS[str(name)][0] in (Nearest, Bilinear):
+    if name in NAMES and name not in TRAINABLE:
         return create(str(name)).eval()
     path = _SHIPPED / f"{name}.safetensors" if name in NAMES else Path(name)
     if name in NAMES and not path.is_file():
-        remedy = f"train them: python -m ilnet train {name}" if name in TRAINABLE else "give the file of a checkpoint"
-        raise FileNotFoundError(f"no weights ship for {name}; {remedy}")
+        raise FileNotFoundError(f"no weights ship for {name}; train them: python -m ilnet train {name}")
     if path.suffix not in (".safetensors", ".pth"):
         raise ValueError(
             f"unknown model {str(name)!r}; known are {', '.join(NAMES)}, a .safetensors file, "

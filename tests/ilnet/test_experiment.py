@@ -3,7 +3,7 @@ import math
 
 import pytest
 
-from ilnet import evaluate, experiment, metrics, train
+from ilnet import evaluate, experiment, metrics, models, train
 from ilnet.sensor import preset
 from ilnet.simulate import pose, simulate
 
@@ -65,7 +65,7 @@ def test_convergence_follows_test_figures_over_seeds(study):
         (name, seed, step) for name in ("liif", "iln") for seed in "01" for step in "24"
     }
     assert all(float(row["seconds"]) > 0 for row in found)
-    assert "times as many" in experiment.results(study).read_text()
+    assert "| steps of liif to the IoU" in experiment.results(study).read_text()
 
 
 def test_steps_to_reach_by_hand():
@@ -95,6 +95,56 @@ def test_ablations_and_measured_scans(study, tmp_path, yard):
     assert {row["prior"] for row in rows(study, "prior")} == {"none", "bilinear", "perspective"}
     assert {row["beams"] for row in rows(study, "real")} == {"8", "16"}
     assert set(metrics.FIGURES[:5]) < set(rows(study, "real")[0])
+
+
+def test_without_a_preset_the_networks_that_ship_are_compared(study, monkeypatch):
+    study = experiment.Study(None, study.out)
+    assert study.networks() == {name: name for name in ("liif", "iln", "iln-prior")}
+    trained = []
+    monkeypatch.setattr(train, "train", lambda name, preset_name, *args, **kwargs: trained.append((name, preset_name)))
+    study.trained("iln-0", "iln")
+    assert trained == [("iln", "small")]
+
+
+def test_lidar_sr_has_a_network_for_each_size_that_is_stored(study, monkeypatch):
+    asked = []
+
+    def fake(name, preset_name, folder, archive=None, target=None, **arguments):
+        asked.append((folder.name, name, archive, target))
+        models.save(models.create("bilinear"), folder / f"{name}.safetensors", "bilinear", {})
+
+    monkeypatch.setattr(train, "train", fake)
+    experiment.table(experiment.Study("tiny", study.out, 1, 1, archive=study.out / "stored"))
+    assert asked[3:] == [
+        ("lidar-sr-16", "lidar-sr", study.out / "stored", (16, 256)),
+        ("lidar-sr-32", "lidar-sr", study.out / "stored", (32, 512)),
+    ]
+    assert [row["model"] for row in rows(study, "table")].count("lidar-sr") == 2
+
+
+def test_ratios_by_hand():
+    def row(model, iou, mae, **more):
+        return {"model": model, "size": "128x2048", "iou": str(iou), "mae": str(mae), **more}
+
+    table = [row("liif", 0.2, 2.0), row("bilinear", 0.1, 4.0), row("iln", 0.3, 1.0), row("iln-prior", 0.36, 1.0)]
+    real = [row(name, iou, 1.0, scan="street", beams="32") for name, iou in (("bilinear", 0.2), ("iln-prior", 0.25))]
+    curves = [{"model": name, "step": "10", "iou": str(iou)} for name, iou in (("iln", 0.3), ("liif", 0.2))]
+    found = {row["figure"]: row for row in experiment.ratios({"table": table, "real": real, "convergence": curves})}
+    assert found["IoU of iln over liif, 128x2048"] == {
+        "figure": "IoU of iln over liif, 128x2048",
+        "the paper": "1.40",  # 0.331 / 0.236
+        "ours": "1.50",
+    }
+    assert found["MAE of iln over liif, 128x2048"]["ours"] == "0.50"
+    assert found["IoU of iln-prior over iln, 128x2048"] == {
+        "figure": "IoU of iln-prior over iln, 128x2048",
+        "the paper": "",
+        "ours": "1.20",
+    }
+    assert found["IoU of iln-prior over bilinear, street, 32 beams -> 128x2048"]["ours"] == "1.25"
+    [steps] = [row["ours"] for figure, row in found.items() if figure.startswith("steps of liif")]
+    assert steps == "never in its budget"
+    assert experiment.ratios({}) == []
 
 
 def test_what_is_missing_is_named(study):

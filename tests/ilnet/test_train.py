@@ -183,7 +183,22 @@ def test_stored_images_are_learned_from(tmp_path, quick, monkeypatch):
     monkeypatch.setitem(train.PRESETS, "tiny", dataclasses.replace(train.PRESETS["tiny"], crops=2, columns=1024))
     figures = quick(tmp_path / "out", archive=tmp_path / "data")
     assert set(figures) == {f"val/{name}" for name in metrics.FIGURES}
-    with pytest.raises(ValueError, match=r"preset paper learns from stored images.*--data DIR"):
+    with pytest.raises(ValueError, match=r"iln with preset paper learns from stored images.*128x2048 .*--data DIR"):
         train.train("iln", "paper", tmp_path)
+    with pytest.raises(ValueError, match=r"lidar-sr with preset tiny learns from stored images.*16x1024,64x1024"):
+        train.train("lidar-sr", "tiny", tmp_path, target=(64, 1024))
     with pytest.raises(FileNotFoundError, match="no such folder"):
         quick(tmp_path / "out2", archive=tmp_path / "nothing")
+
+
+def test_lidar_sr_learns_the_one_size_that_it_predicts(tmp_path, quick, yard):
+    sensors = {size: preset(f"paper-{size}") for size in ("16x1024", "64x1024")}
+    archive = data.Archive.create(tmp_path / "data", 2, sensors, {"towns": ["nowhere"]})
+    flat = {size: np.full((2, *sensor.shape), 5000, np.uint16) for size, sensor in sensors.items()}
+    archive.write(0, flat, np.zeros(2, int), np.zeros(2, int), np.zeros((2, 4, 4)))
+    figures = train.train("lidar-sr", "tiny", tmp_path, steps=1, archive=tmp_path / "data", target=(64, 1024))
+    assert set(figures) == {f"val/{name}" for name in metrics.FIGURES}
+    model = models.load(tmp_path / "lidar-sr.safetensors")
+    assert (model.rows, model.columns) == (4, 1)
+    scan = simulate(yard, sensors["16x1024"], pose((0.0, 0.0, 1.8)))
+    assert model.upsample(scan, sensors["64x1024"]).sensor.shape == (64, 1024)
