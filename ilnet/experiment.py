@@ -79,13 +79,16 @@ class Study:
         """The networks that are compared with other methods."""
         return {name: self.trained(name, name) if self.preset else name for name in ("liif", "iln", "iln-prior")}
 
-    def compare(self, files: dict[str, str | Path], sizes: Sequence[tuple[int, int]] = ()) -> list[dict[str, Any]]:
+    def compare(
+        self, files: Mapping[str, str | Path | models.Model], sizes: Sequence[tuple[int, int]] = ()
+    ) -> list[dict[str, Any]]:
         """Measures models, by the names their rows shall bear, on the test towns; at all `SIZES` unless told."""
+        loaded = {label: f if isinstance(f, models.Model) else models.load(f) for label, f in files.items()}
         rows = []
         for size in sizes or SIZES:
             output = evaluate.INPUT.resize(*size)
             pairs = [pair for town in towns.TEST for pair in evaluate.town_pairs(town, self.scans, output)]
-            rows += evaluate.evaluate({label: models.load(file) for label, file in files.items()}, pairs)
+            rows += evaluate.evaluate(loaded, pairs)
         return rows
 
     def write(self, name: str, rows: Sequence[dict[str, Any]]) -> None:
@@ -218,11 +221,12 @@ def _frame_time(model: models.Model) -> float:
 
 def prior(study: Study) -> None:
     """Ours: a geometric prior on the weights."""
-    rows = []
-    for kind in ("none", "bilinear", "perspective"):
-        label = "iln-0" if kind == "none" else f"iln-{kind}"
-        file = study.trained(label, "iln") if kind == "none" else study.trained(label, "iln-prior", prior=kind)
-        rows += [{"prior": kind, **row} for row in study.compare({label: file})]
+    files: dict[str, str | Path] = {"none": study.trained("iln-0", "iln")}
+    files |= {kind: study.trained(f"iln-{kind}", "iln-prior", prior=kind) for kind in ("bilinear", "perspective")}
+    bare = models.load(files["perspective"])
+    assert isinstance(bare, models.ILN)
+    bare.dead_zone = 0.0
+    rows = [{"prior": row.pop("model"), **row} for row in study.compare({**files, "perspective, no dead zone": bare})]
     study.write("prior", rows)
     _bars(study, "prior", rows, "prior", "prior")
 

@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 
 __all__ = [
+    "DEAD_SLOPE",
     "PRIORS",
     "RANGE_FLOOR",
     "area_blend",
@@ -21,12 +22,15 @@ __all__ = [
     "gather_neighbours",
     "neighbour_attention",
     "neighbours",
+    "shrink",
 ]
 
 PRIORS = ("none", "bilinear", "perspective")
 
 # Metres. The perspective prior divides by range; no LiDAR measures below this.
 RANGE_FLOOR = 0.1
+# What is left of a small difference of scores in the dead zone.
+DEAD_SLOPE = 0.1
 
 
 def neighbours(
@@ -126,6 +130,21 @@ def neighbour_attention(
     return tokens + F.linear(attended.transpose(2, 3).reshape(tokens.shape), weight, bias)
 
 
+def shrink(scores: torch.Tensor, dead_zone: float) -> torch.Tensor:
+    """Lets the scores (..., 4) of the neighbours differ clearly or hardly at all: a prior stands where they hesitate.
+
+        c = s - mean(s),    s' = c (c² + κ d²) / (c² + d²)
+
+    Differences far beyond the dead zone d pass as they are, those within it shrink, down to κ = `DEAD_SLOPE` of
+    themselves: enough of a slope to learn from. d = 0 changes no weight.
+    """
+    if dead_zone == 0:
+        return scores
+    centred = scores - scores.mean(-1, keepdim=True)
+    squares, zone = centred.square(), dead_zone**2
+    return centred * (squares + DEAD_SLOPE * zone) / (squares + zone)
+
+
 def fused_decode(
     projected: Any,
     image: torch.Tensor,
@@ -134,6 +153,7 @@ def fused_decode(
     prior: str,
     wrap: bool,
     area_floor: float,
+    dead_zone: float,
     eps: float,
 ) -> torch.Tensor:
     """`kernels.fused_decode`: a `Projected`, image (B, H, W), queries (B, Q, 2) and `DecoderWeights`."""
@@ -146,7 +166,7 @@ def fused_decode(
     scores = F.linear(
         F.layer_norm(t, bias.shape, weights.head_norm[0], weights.head_norm[1], eps), *weights.score
     ).squeeze(-1)
-    return gather_blend(image, queries, scores, prior, wrap, area_floor)[0]
+    return gather_blend(image, queries, shrink(scores, dead_zone), prior, wrap, area_floor)[0]
 
 
 def cast_rays(

@@ -18,7 +18,7 @@ from kernels import (
     neighbour_attention,
     project_pixels,
 )
-from kernels.reference import PRIORS
+from kernels.reference import PRIORS, shrink
 
 __all__ = ["ILN"]
 
@@ -80,6 +80,8 @@ class ILN(Model):
         heads: Attention heads; they divide `features`.
         dropout: Rate in the attention blocks while training; the authors' is 0.1.
         area_floor: Least bilinear area in the prior, so that a measured pixel can be overruled.
+        dead_zone: Differences of scores within which a prior stands, once trained: so small ones are more often noise
+            than knowledge. See `kernels.reference.shrink`.
         norm_range: Metres that the encoder sees as +1; no return is filled with it.
 
     Raises:
@@ -97,6 +99,7 @@ class ILN(Model):
         heads: int = 8,
         dropout: float = 0.0,
         area_floor: float = 1e-4,
+        dead_zone: float = 0.0,
         norm_range: float = 100.0,
     ):
         if prior not in PRIORS:
@@ -104,7 +107,8 @@ class ILN(Model):
         if heads < 1 or features % heads:
             raise ValueError(f"heads is {heads}; it should divide the {features} features")
         super().__init__()
-        self.prior, self.area_floor, self.norm_range, self.dropout = prior, area_floor, norm_range, dropout
+        self.prior, self.area_floor, self.dead_zone = prior, area_floor, dead_zone
+        self.norm_range, self.dropout = norm_range, dropout
         self.encoder = Encoder(features, blocks)
         self.position = nn.Linear(2, features)
         self.blocks = nn.ModuleList(_Block(features, heads, dropout) for _ in range(depth))
@@ -133,7 +137,8 @@ class ILN(Model):
             z = z + self.position(offsets * OFFSET_SCALE)
         elif self.is_fused(encoded):
             weights = self._decoder_weights()
-            return fused_decode(projected, image, queries, weights, self.prior, wrap, area_floor=self.area_floor)
+            floor, zone = self.area_floor, self.dead_zone
+            return fused_decode(projected, image, queries, weights, self.prior, wrap, area_floor=floor, dead_zone=zone)
         else:
             first, blocks = self._first(), self.blocks[1:]
             output = first.attention.out.weight, first.attention.out.bias
@@ -142,6 +147,8 @@ class ILN(Model):
         for block in blocks:
             z = block(z, self.backend)
         scores = self.head(z).squeeze(-1).to(image.dtype)
+        if not self.training:
+            scores = shrink(scores, self.dead_zone)
         return gather_blend(image, queries, scores, self.prior, wrap, area_floor=self.area_floor, backend=self.backend)
 
     def is_fused(self, encoded: _Encoded) -> bool:

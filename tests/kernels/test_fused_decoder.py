@@ -52,6 +52,26 @@ def test_is_the_decoder_layer_by_layer(channels, prior, wrap, poisoned):
         torch.testing.assert_close(ranges, expected, rtol=0, atol=METRES)
 
 
+@pytest.mark.parametrize("dead_zone", [0.5, 3.0])
+def test_scores_shrink_in_the_dead_zone(dead_zone):
+    projected, image, queries, weights = draw()
+    plain = fused_decode(projected, image, queries, weights, "perspective", dead_zone=dead_zone, backend="torch")
+    ranges = fused_decode(projected, image, queries, weights, "perspective", dead_zone=dead_zone)
+    torch.testing.assert_close(ranges, plain, rtol=0, atol=METRES)
+    assert not torch.allclose(ranges, fused_decode(projected, image, queries, weights, "perspective"), atol=0.1)
+
+
+def test_shrink_by_hand():
+    scores = torch.tensor([[3.0, 1.0, 1.0, 3.0], [0.02, 0.0, 0.0, 0.02], [7.0, 7.0, 7.0, 7.0], [400.0, 0.0, 0.0, 0.0]])
+    shrunk = reference.shrink(scores, 1.0)
+    # Differences of 1 from the mean, the width of the zone, keep (1 + κ) / 2; small ones κ; none, none; large ones all.
+    torch.testing.assert_close(shrunk[0], torch.tensor([0.55, -0.55, -0.55, 0.55]))
+    torch.testing.assert_close(shrunk[1], torch.tensor([1e-3, -1e-3, -1e-3, 1e-3]), rtol=1e-2, atol=0)
+    assert torch.equal(shrunk[2], torch.zeros(4))
+    torch.testing.assert_close(shrunk[3] - shrunk[3, 1], scores[3], rtol=1e-3, atol=0)
+    assert reference.shrink(scores, 0.0) is scores
+
+
 def test_any_number_of_queries_and_cores():
     projected, image, queries, weights = draw(count=1000)
     expected = fused_decode(projected, image, queries, weights)
@@ -79,7 +99,7 @@ def test_a_score_of_minus_infinity_and_an_area_of_zero_shut_a_neighbour_out():
 def test_opcheck_without_gradients():
     (pixels, slope, shift, gram, _), image, queries, _ = draw(count=9)
     matrices, rows = torch.randn(3, C, C), torch.randn(4, C)
-    arguments = (pixels, queries, slope, shift, gram, image, matrices, rows, 1, 1e-3, 1e-5, True)
+    arguments = (pixels, queries, slope, shift, gram, image, matrices, rows, 1, 1e-3, 0.5, 1e-5, True)
     torch.library.opcheck(_fused_decode, arguments)
 
 
