@@ -347,8 +347,12 @@ def experiment(
         raise click.UsageError("name some experiments, or all")
     from ilnet import experiment as experiments
 
+    chosen = tuple(experiments.EXPERIMENTS) if "all" in names else names
+    for name, option, value in (("rays", "--data DIR", data), ("real", "--measured FILE", measured)):
+        if name in chosen and not value:  # said before hours of training, not after
+            raise click.UsageError(f"{name} needs {option}")
     study = experiments.Study(preset, out, scans, seeds, data, measured)
-    for name in experiments.EXPERIMENTS if "all" in names else names:
+    for name in chosen:
         experiments.EXPERIMENTS[name](study)
         click.echo(experiments.results(study))
 

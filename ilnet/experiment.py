@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -67,12 +68,19 @@ class Study:
     archive: Path | None = None
     measured: tuple[Path, ...] = ()
 
-    def trained(self, label: str, name: str, seed: int = 0, archive: Path | None = None, **arguments: Any) -> Path:
-        """Trains a network, unless that was done, and returns its file of weights."""
+    @cached_property
+    def probe(self) -> list[evaluate.Pair]:
+        """Test scans that are measured in the course of a training."""
+        output = evaluate.INPUT.resize(*SIZES[0])
+        return [pair for town in towns.TEST for pair in evaluate.town_pairs(town, 4, output)]
+
+    def trained(self, label: str, name: str, **options: Any) -> Path:
+        """Trains a network, unless that was done, and returns its file of weights; options are those of `train`."""
         folder = self.out / "weights" / label
         file = folder / f"{name}.safetensors"
         if not file.exists():
-            train.train(name, self.preset or "small", folder, seed=seed, archive=archive, **arguments)
+            probe = () if name == "lidar-sr" else self.probe  # which predicts one size only
+            train.train(name, self.preset or "small", folder, probe=probe, **options)
         return file
 
     def networks(self) -> dict[str, str | Path]:
@@ -141,11 +149,10 @@ def _draw_points(study: Study, files: dict[str, str | Path]) -> None:
 
 def convergence(study: Study) -> None:
     """The paper's figure of convergence: test figures in the course of training, over several seeds."""
-    pairs = [pair for town in towns.TEST for pair in evaluate.town_pairs(town, 4, evaluate.INPUT.resize(*SIZES[0]))]
     rows: list[dict[str, Any]] = []
     for name in ("liif", "iln"):
         for seed in range(study.seeds):
-            folder = study.trained(f"{name}-{seed}", name, seed, probe=pairs).parent
+            folder = study.trained(f"{name}-{seed}", name, seed=seed).parent
             rows += [{"model": name, "seed": seed, **row} for row in _probed(folder / name)]
     study.write("convergence", rows)
     figure = Figure(figsize=(10, 3.2), layout="constrained")

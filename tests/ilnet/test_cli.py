@@ -208,6 +208,11 @@ BAD = {
     "unknown model": (["train", "ilm"], "'ilm'"),
     "unknown preset": (["train", "iln", "--preset", "huge"], "unknown preset 'huge'"),
     "no steps": (["train", "iln", "--steps", "0"], "--steps"),
+    "size of no images": (["train", "iln", "--size", "64x1024"], "--size goes with --data DIR"),
+    "lidar-sr on rays": (["train", "lidar-sr"], "lidar-sr with preset tiny learns from stored images"),
+    "no experiment": (["experiment"], "name some experiments, or all"),
+    "all without images": (["experiment", "all"], "rays needs --data DIR"),
+    "real without scans": (["experiment", "table", "real"], "real needs --measured FILE"),
     "unknown command": (["dmeo"], "dmeo"),
 }
 

@@ -110,7 +110,7 @@ def test_without_a_preset_the_networks_that_ship_are_compared(study, monkeypatch
 def test_lidar_sr_has_a_network_for_each_size_that_is_stored(study, monkeypatch):
     asked = []
 
-    def fake(name, preset_name, folder, archive=None, target=None, **arguments):
+    def fake(name, preset_name, folder, archive=None, target=None, **options):
         asked.append((folder.name, name, archive, target))
         models.save(models.create("bilinear"), folder / f"{name}.safetensors", "bilinear", {})
 
