@@ -11,7 +11,7 @@ from ilnet.sensor import preset
 
 __all__ = ["METHODS", "OUTPUT", "TOWN", "demo", "from_town"]
 
-METHODS = ("nearest", "bilinear", "bilinear-inverse", "iln", "iln-prior")
+METHODS = ("nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-prior")
 OUTPUT = preset("paper-128x2048")
 # No network was trained here, nor any choice made.
 TOWN = "town10"

@@ -116,7 +116,7 @@ class Study:
 
 def table(study: Study) -> None:
     """The paper's Table II: all methods at three sizes."""
-    files: dict[str, str | Path] = {name: name for name in ("nearest", "bilinear", "bilinear-inverse")}
+    files: dict[str, str | Path] = {name: name for name in ("nearest", "bilinear", "bilinear-inverse", "planes")}
     files |= study.networks()
     rows = study.compare(files)
     if study.archive:
@@ -273,7 +273,7 @@ def real(study: Study) -> None:
     """Ours: measured scans, of which the networks saw none; some beams are kept, all are predicted."""
     if not study.measured:
         raise ValueError("no measured scans are named: give some with --measured FILE, such as frames of your sensor")
-    files: dict[str, str | Path] = {name: name for name in ("bilinear", "bilinear-inverse")}
+    files: dict[str, str | Path] = {name: name for name in ("bilinear", "bilinear-inverse", "planes")}
     files |= study.networks()
     loaded = {label: models.load(file) for label, file in files.items()}
     rows = []

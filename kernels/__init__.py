@@ -6,6 +6,7 @@ from kernels.fused_decoder import DecoderWeights, fused_decode, fused_decode_ser
 from kernels.gather import gather_neighbours
 from kernels.gather_blend import gather_blend
 from kernels.neighbour_attention import Projected, neighbour_attention, project_pixels
+from kernels.plane_prior import plane_prior
 from kernels.raycast import Hits, Mesh
 
 __all__ = [
@@ -20,5 +21,6 @@ __all__ = [
     "gather_blend",
     "gather_neighbours",
     "neighbour_attention",
+    "plane_prior",
     "project_pixels",
 ]

@@ -115,6 +115,7 @@ def _fused_decode_kernel(
     prior: int,
     area_floor: float,
     dead_zone: float,
+    added: wp.array2d[float],
     share: int,
     group: int,
     x_scalars: wp.array2d[float],
@@ -173,6 +174,9 @@ def _fused_decode_kernel(
                 ranges[t] = image[pixel[t]]
             if dead_zone > 0.0:
                 scores = _shrink(scores, dead_zone)
+            if added.shape[0] > 0:
+                for t in range(4):
+                    scores[t] = scores[t] + added[n, t]
             blended_out[n] = _blend(scores, ranges, queries[n, 0], queries[n, 1], prior, area_floor)
 
 
@@ -211,6 +215,7 @@ def _fused_decode(
     prior: int,
     area_floor: float,
     dead_zone: float,
+    added: torch.Tensor,
     eps: float,
     wrap: bool,
 ) -> torch.Tensor:
@@ -220,7 +225,7 @@ def _fused_decode(
     tokens, x, h = pixels.new_empty(3, 4 * _GROUP * _WORKERS, channels)
     share = -(-batch * count // _WORKERS)
     first = arguments(pixels, queries, slope, shift, gram, HEADS, eps, wrap)
-    others = [image.reshape(-1), weights, biases, prior, area_floor, dead_zone, share, _GROUP, x, h]
+    others = [image.reshape(-1), weights, biases, prior, area_floor, dead_zone, added.view(-1, 4), share, _GROUP, x, h]
     launch(_fused_decode_kernel, _WORKERS, [*first, *others], [tokens, x, h, blended.view(-1)], least=1)
     return blended
 
@@ -238,6 +243,7 @@ def _(
     prior: int,
     area_floor: float,
     dead_zone: float,
+    added: torch.Tensor,
     eps: float,
     wrap: bool,
 ) -> torch.Tensor:
@@ -257,6 +263,7 @@ def fused_decode(
     *,
     area_floor: float = 0.0,
     dead_zone: float = 0.0,
+    added: torch.Tensor | None = None,
     eps: float = 1e-5,
     backend: str = "warp",
 ) -> torch.Tensor:
@@ -271,6 +278,7 @@ def fused_decode(
         wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
         area_floor: As in `gather_blend`.
         dead_zone: Within which differences of scores shrink; see `kernels.reference.shrink`. 0 for none.
+        added: (B, Q, 4) to add to the scores after that, such as `plane_prior`.
         eps: Of the layer norms.
         backend: "warp", or "torch" for the plain twin in `kernels.reference`, which serves any table.
 
@@ -292,8 +300,12 @@ def fused_decode(
         raise ValueError(f"image has shape {tuple(image.shape)}; it should be {(batch, height, width)}")
     if queries.ndim != 3 or len(queries) != batch:
         raise ValueError(f"queries has shape {tuple(queries.shape)}; it should be ({batch}, Q, 2)")
+    if added is not None and added.shape != (batch, queries.shape[1], 4):
+        raise ValueError(f"added has shape {tuple(added.shape)}; it should be {(batch, queries.shape[1], 4)}")
     if backend == "torch":
-        return reference.fused_decode(projected, image, queries, weights, prior, wrap, area_floor, dead_zone, eps)
+        return reference.fused_decode(
+            projected, image, queries, weights, prior, wrap, area_floor, dead_zone, added, eps
+        )
     if not fused_decode_serves(projected):
         raise ValueError("projected has no kernel: it should be float32 on a CPU, with 8 heads and C a multiple of 64")
     pixels, slope, shift, gram, heads = projected
@@ -306,5 +318,6 @@ def fused_decode(
         ).float()
         return _fused_decode(
             pixels.contiguous(), queries.to(pixels.dtype).contiguous(), slope, shift, gram, image.float().contiguous(),
-            matrices, rows, PRIORS.index(prior), area_floor, dead_zone, eps, wrap,
+            matrices, rows, PRIORS.index(prior), area_floor, dead_zone,
+            pixels.new_empty(0, 4) if added is None else added.to(pixels.dtype).contiguous(), eps, wrap,
         )  # fmt: skip

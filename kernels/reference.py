@@ -11,8 +11,10 @@ import torch.nn.functional as F
 
 __all__ = [
     "DEAD_SLOPE",
+    "PARTED",
     "PRIORS",
     "RANGE_FLOOR",
+    "SHARPEST",
     "area_blend",
     "areas",
     "attend_neighbours",
@@ -22,6 +24,7 @@ __all__ = [
     "gather_neighbours",
     "neighbour_attention",
     "neighbours",
+    "plane_prior",
     "shrink",
 ]
 
@@ -29,6 +32,10 @@ PRIORS = ("none", "bilinear", "perspective")
 
 # Metres. The perspective prior divides by range; no LiDAR measures below this.
 RANGE_FLOOR = 0.1
+# Two inverse ranges that differ by more than this share of the smaller one are not of one surface.
+PARTED = 0.03
+# A step that is as sharp or sharper has nothing between.
+SHARPEST = 1e3
 # What is left of a small difference of scores in the dead zone.
 DEAD_SLOPE = 0.1
 
@@ -130,6 +137,41 @@ def neighbour_attention(
     return tokens + F.linear(attended.transpose(2, 3).reshape(tokens.shape), weight, bias)
 
 
+def plane_prior(
+    image: torch.Tensor, queries: torch.Tensor, wrap: bool, sharpness: float, area_floor: float
+) -> torch.Tensor:
+    """`kernels.plane_prior` on image (B, H, W) and queries (B, Q, 2)."""
+
+    def step(x: torch.Tensor) -> torch.Tensor:
+        return (x >= 0.5).to(x.dtype) if sharpness >= SHARPEST else 1 / (1 + ((1 - x) / x) ** sharpness)
+
+    height = image.shape[1]
+    rows, columns, _ = neighbours(queries, height, image.shape[2], wrap)
+    inverse = 1 / image.clamp(min=RANGE_FLOOR)
+    batch = torch.arange(len(image), device=image.device).view(-1, 1, 1)
+    f, g = (queries - queries.floor()).unsqueeze(-2).unbind(-1)  # (B, Q, 1)
+    above, below, columns = rows[..., :1], rows[..., 2:3], columns[..., :2]  # one each, both columns
+    u, v = inverse[batch, above, columns], inverse[batch, below, columns]
+    before, after = inverse[batch, (above - 1).clamp(min=0), columns], inverse[batch, (below + 1) % height, columns]
+    between = below > above
+    down = torch.where(between & (above > 0), u - before, v - u)
+    up = torch.where(between & (below < height - 1), v - after, u - v)
+    first, second = u + down * f, v + up * (1 - f)
+    at_u, at_v = u - v - up, u + down - v
+    expected = torch.where((at_u > 0) & (at_v < 0), torch.maximum(first, second), u + (v - u) * f)
+    parted = (torch.stack((at_u, at_v, u - v)).abs() > PARTED * torch.minimum(u, v)).all(0) & (at_u * at_v > 0)
+    low, high, s = torch.minimum(u, v), torch.maximum(u, v), step(f)
+    expected = torch.where(parted, first.clamp(low, high) * (1 - s) + second.clamp(low, high) * s, expected)
+    expected = expected.clamp(low, high)
+    share = torch.where(u == v, f, (expected - u) / (v - u))
+    (left, right) = expected.split(1, -1)
+    apart = (left - right).abs() > PARTED * torch.minimum(left, right)
+    g = torch.where(apart, step(g), g)
+    across = torch.cat((1 - g, g), -1)
+    areas = torch.cat(((1 - share) * across, share * across), -1)
+    return (areas.clamp(min=area_floor) * torch.cat((u, v), -1)).log()
+
+
 def shrink(scores: torch.Tensor, dead_zone: float) -> torch.Tensor:
     """Lets the scores (..., 4) of the neighbours differ clearly or hardly at all: a prior stands where they hesitate.
 
@@ -154,6 +196,7 @@ def fused_decode(
     wrap: bool,
     area_floor: float,
     dead_zone: float,
+    added: torch.Tensor | None,
     eps: float,
 ) -> torch.Tensor:
     """`kernels.fused_decode`: a `Projected`, image (B, H, W), queries (B, Q, 2) and `DecoderWeights`."""
@@ -166,7 +209,8 @@ def fused_decode(
     scores = F.linear(
         F.layer_norm(t, bias.shape, weights.head_norm[0], weights.head_norm[1], eps), *weights.score
     ).squeeze(-1)
-    return gather_blend(image, queries, shrink(scores, dead_zone), prior, wrap, area_floor)[0]
+    scores = shrink(scores, dead_zone) + (0 if added is None else added)
+    return gather_blend(image, queries, scores, prior, wrap, area_floor)[0]
 
 
 def cast_rays(

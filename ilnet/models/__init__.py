@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 
 from ilnet.models import authors
 from ilnet.models.base import PRECISIONS, Model, Upsampler, returns
-from ilnet.models.bilinear import Bilinear, Nearest
+from ilnet.models.bilinear import Bilinear, Nearest, Planes
 from ilnet.models.iln import ILN
 from ilnet.models.lidar_sr import LiDARSR
 from ilnet.models.liif import LIIF
@@ -25,6 +25,7 @@ __all__ = [
     "LiDARSR",
     "Model",
     "Nearest",
+    "Planes",
     "Upsampler",
     "create",
     "load",
@@ -37,13 +38,14 @@ _MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
     "nearest": (Nearest, {}),
     "bilinear": (Bilinear, {}),
     "bilinear-inverse": (Bilinear, {"inverse": True}),
+    "planes": (Planes, {}),
     "liif": (LIIF, {}),
     "lidar-sr": (LiDARSR, {}),
     "iln": (ILN, {}),
     "iln-prior": (ILN, {"prior": "perspective"}),
 }
 NAMES = tuple(_MODELS)
-TRAINABLE = tuple(name for name, (kind, _) in _MODELS.items() if kind not in (Nearest, Bilinear))
+TRAINABLE = tuple(name for name, (kind, _) in _MODELS.items() if kind not in (Nearest, Bilinear, Planes))
 
 _SHIPPED = Path(__file__).parents[1] / "weights"
 

@@ -1,11 +1,11 @@
-"""Baselines without parameters: the nearest pixel, and the paper's bilinear interpolation in two spaces."""
+"""Baselines without parameters: the nearest pixel, the paper's bilinear interpolation in two spaces, and planes."""
 
 import torch
 
 from ilnet.models.base import Model
-from kernels import gather_blend
+from kernels import gather_blend, plane_prior
 
-__all__ = ["Bilinear", "Nearest"]
+__all__ = ["Bilinear", "Nearest", "Planes"]
 
 
 class Nearest(Model):
@@ -33,3 +33,11 @@ class Bilinear(Model):
         """Answers queries (B, Q, 2) with ranges (B, Q) [m]."""
         scores = queries.new_zeros(*queries.shape[:-1], 4)
         return gather_blend(image, queries, scores, self.prior, wrap, backend=self.backend)
+
+
+class Planes(Model):
+    """What planes, the creases between them and the edges before them suggest; see `kernels.plane_prior`."""
+
+    def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+        """Answers queries (B, Q, 2) with ranges (B, Q) [m]."""
+        return gather_blend(image, queries, plane_prior(image, queries, wrap, backend=self.backend), wrap=wrap)

@@ -16,6 +16,7 @@ from kernels import (
     gather_blend,
     gather_neighbours,
     neighbour_attention,
+    plane_prior,
     project_pixels,
 )
 from kernels.reference import PRIORS, shrink
@@ -73,13 +74,15 @@ class ILN(Model):
 
     Args:
         depth: Number of attention blocks D.
-        prior: What the untrained weights are close to: "none" (the paper), "bilinear" or "perspective"; see
-            `kernels.gather_blend`. With a prior the head starts at zero: the untrained network *is* that interpolation.
+        prior: What the untrained weights are close to: "none" (the paper), "bilinear" or "perspective", see
+            `kernels.gather_blend`, or "planes", see `kernels.plane_prior`. With a prior the head starts at zero: the
+            untrained network *is* that interpolation.
         features: Channels of the encoder and of the attention.
         blocks: Residual blocks of the encoder.
         heads: Attention heads; they divide `features`.
         dropout: Rate in the attention blocks while training; the authors' is 0.1.
         area_floor: Least bilinear area in the prior, so that a measured pixel can be overruled.
+        sharpness: Of the step that "planes" expects at an edge; soft enough to learn where it is.
         dead_zone: Differences of scores within which a prior stands, once trained: so small ones are more often noise
             than knowledge. See `kernels.reference.shrink`.
         norm_range: Metres that the encoder sees as +1; no return is filled with it.
@@ -99,15 +102,16 @@ class ILN(Model):
         heads: int = 8,
         dropout: float = 0.0,
         area_floor: float = 1e-4,
+        sharpness: float = 4.0,
         dead_zone: float = 0.0,
         norm_range: float = 100.0,
     ):
-        if prior not in PRIORS:
-            raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}")
+        if prior not in (*PRIORS, "planes"):
+            raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}, planes")
         if heads < 1 or features % heads:
             raise ValueError(f"heads is {heads}; it should divide the {features} features")
         super().__init__()
-        self.prior, self.area_floor, self.dead_zone = prior, area_floor, dead_zone
+        self.prior, self.area_floor, self.sharpness, self.dead_zone = prior, area_floor, sharpness, dead_zone
         self.norm_range, self.dropout = norm_range, dropout
         self.encoder = Encoder(features, blocks)
         self.position = nn.Linear(2, features)
@@ -131,14 +135,18 @@ class ILN(Model):
     def decode(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Weighs and blends the 4 neighbours of each query."""
         features, projected = encoded
-        blocks = self.blocks
+        blocks, prior, planes = self.blocks, self.prior, None
+        if prior == "planes":
+            options = {"sharpness": self.sharpness, "area_floor": self.area_floor}
+            prior, planes = "none", plane_prior(image, queries, wrap, **options, backend=self.backend)
         if projected is None:
             z, offsets = gather_neighbours(features, queries, wrap, self.backend)
             z = z + self.position(offsets * OFFSET_SCALE)
         elif self.is_fused(encoded):
-            weights = self._decoder_weights()
-            floor, zone = self.area_floor, self.dead_zone
-            return fused_decode(projected, image, queries, weights, self.prior, wrap, area_floor=floor, dead_zone=zone)
+            floor, zone, weights = self.area_floor, self.dead_zone, self._decoder_weights()
+            return fused_decode(
+                projected, image, queries, weights, prior, wrap, area_floor=floor, dead_zone=zone, added=planes
+            )
         else:
             first, blocks = self._first(), self.blocks[1:]
             output = first.attention.out.weight, first.attention.out.bias
@@ -149,7 +157,9 @@ class ILN(Model):
         scores = self.head(z).squeeze(-1).to(image.dtype)
         if not self.training:
             scores = shrink(scores, self.dead_zone)
-        return gather_blend(image, queries, scores, self.prior, wrap, area_floor=self.area_floor, backend=self.backend)
+        if planes is not None:
+            scores = scores + planes
+        return gather_blend(image, queries, scores, prior, wrap, area_floor=self.area_floor, backend=self.backend)
 
     def is_fused(self, encoded: _Encoded) -> bool:
         """Whether the whole decoder is one kernel: in inference, at depth 1, where `fused_decode` serves."""

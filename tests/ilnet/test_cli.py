@@ -9,7 +9,7 @@ import pytest
 
 from ilnet import metrics, models, scan
 
-METHODS = {"nearest", "bilinear", "bilinear-inverse", "iln", "iln-prior"}
+METHODS = {"nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-prior"}
 
 
 def ilnet(*arguments, cwd):

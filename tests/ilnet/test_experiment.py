@@ -41,7 +41,7 @@ def test_the_table_has_every_method_at_every_size_beside_the_paper(study):
     assert [(row["size"], row["model"]) for row in found] == [
         (size, name)
         for size in ("16x256", "32x512")
-        for name in ("nearest", "bilinear", "bilinear-inverse", "liif", "iln", "iln-prior")
+        for name in ("nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-prior")
     ]
     assert all(0 < float(row["iou"]) <= 1 for row in found if row["model"] != "liif")
     assert {path.name for path in study.out.glob("*.png")} == {"table.png", "points-town07.png", "points-town10.png"}

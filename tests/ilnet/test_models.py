@@ -1,4 +1,5 @@
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -108,10 +109,14 @@ def plain_iln(model, image, queries, wrap):
         q, k, v = attention.qkv(attention.norm(z)).unflatten(-1, (3, attention.heads, -1)).transpose(2, 4).unbind(3)
         z = z + attention.out(F.scaled_dot_product_attention(q, k, v).transpose(2, 3).flatten(-2))
         z = z + block.feed_forward(z)
-    return reference.gather_blend(image, queries, model.head(z).squeeze(-1), model.prior, wrap, model.area_floor)[0]
+    scores, prior = model.head(z).squeeze(-1), model.prior
+    if prior == "planes":
+        scores = scores + reference.plane_prior(image, queries, wrap, model.sharpness, model.area_floor)
+        prior = "none"
+    return reference.gather_blend(image, queries, scores, prior, wrap, model.area_floor)[0]
 
 
-@pytest.mark.parametrize("prior", reference.PRIORS)
+@pytest.mark.parametrize("prior", [*reference.PRIORS, "planes"])
 @pytest.mark.parametrize("wrap", [True, False])
 @pytest.mark.parametrize("depth", [0, 1, 2])
 def test_iln_matches_a_plain_formulation_with_gradients(prior, wrap, depth):
@@ -170,10 +175,13 @@ def test_gives_what_the_authors_network_gives(name, files, shared):
     torch.testing.assert_close(wrapped[inner] / 50 - 1, normalised[inner], rtol=0, atol=NORMALISED)
 
 
-@pytest.mark.parametrize(("prior", "baseline"), [("bilinear", "bilinear"), ("perspective", "bilinear-inverse")])
+@pytest.mark.parametrize(
+    ("prior", "baseline"), [("bilinear", "bilinear"), ("perspective", "bilinear-inverse"), ("planes", "planes")]
+)
 def test_an_untrained_network_with_a_prior_is_that_interpolation(prior, baseline):
     torch.manual_seed(0)
-    model = models.create("iln", prior=prior, features=16, blocks=1, heads=4, area_floor=0.0).eval()
+    sharp = {"area_floor": 0.0, "sharpness": math.inf}
+    model = models.create("iln", prior=prior, features=16, blocks=1, heads=4, **sharp).eval()
     image, queries = draw()
     torch.testing.assert_close(model(image, queries), models.create(baseline)(image, queries), rtol=0, atol=METRES)
 
@@ -199,7 +207,7 @@ def test_blends_stay_between_the_neighbours():
     assert (ranges <= gathered.amax((-1, -2)) + METRES).all()
 
 
-@pytest.mark.parametrize("name", ["nearest", "bilinear", "bilinear-inverse", "liif", "iln"])
+@pytest.mark.parametrize("name", ["nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln"])
 def test_upsample_to_any_sensor(name, yard):
     torch.manual_seed(0)
     arguments = {"features": 16, "blocks": 1} if name in models.TRAINABLE else {}
@@ -347,7 +355,7 @@ def test_bilinear_upsampling_is_close_to_the_truth_on_the_ground(yard):
     here = pose((60.0, -60.0, 1.8))
     scan = simulate(yard, preset("paper-16x1024"), here)
     truth = simulate(yard, preset("paper-64x1024"), here)
-    for name, metres in (("bilinear", 0.7), ("bilinear-inverse", 0.02)):
+    for name, metres in (("bilinear", 0.7), ("bilinear-inverse", 0.02), ("planes", 0.02)):
         dense = models.create(name).ranges(scan, truth.sensor)
         near = (truth.ranges > 0) & (truth.ranges < 15)
         assert near.sum() > 5000
@@ -455,7 +463,7 @@ def test_bad_weights_are_refused(tmp_path):
         models.create("ilm")
     with pytest.raises(FileNotFoundError, match="no weights ship for liif"):
         models.load("liif")
-    with pytest.raises(FileNotFoundError, match="no weights ship for lidar-sr; give the file"):
+    with pytest.raises(FileNotFoundError, match="no weights ship for lidar-sr; train them"):
         models.load("lidar-sr")
     with pytest.raises(FileNotFoundError, match="no such file of weights"):
         models.load(tmp_path / "none.safetensors")

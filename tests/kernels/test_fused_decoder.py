@@ -2,7 +2,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from kernels import DecoderWeights, fused_decode, neighbour_attention, project_pixels, reference
+from kernels import DecoderWeights, fused_decode, neighbour_attention, plane_prior, project_pixels, reference
 from kernels.fused_decoder import _fused_decode
 
 # float32 ranges below 100 m behind a decoder.
@@ -61,6 +61,18 @@ def test_scores_shrink_in_the_dead_zone(dead_zone):
     assert not torch.allclose(ranges, fused_decode(projected, image, queries, weights, "perspective"), atol=0.1)
 
 
+def test_scores_may_be_added(poisoned):
+    projected, image, queries, weights = draw()
+    added = plane_prior(image, queries, area_floor=1e-3)
+    ranges, plain = (
+        fused_decode(projected, image, queries, weights, added=added, dead_zone=0.5, backend=backend)
+        for backend in ("warp", "torch")
+    )
+    torch.testing.assert_close(ranges, plain, rtol=0, atol=METRES)
+    with pytest.raises(ValueError, match=r"added has shape \(2, 500\)"):
+        fused_decode(projected, image, queries, weights, added=added[..., 0])
+
+
 def test_shrink_by_hand():
     scores = torch.tensor([[3.0, 1.0, 1.0, 3.0], [0.02, 0.0, 0.0, 0.02], [7.0, 7.0, 7.0, 7.0], [400.0, 0.0, 0.0, 0.0]])
     shrunk = reference.shrink(scores, 1.0)
@@ -99,7 +111,22 @@ def test_a_score_of_minus_infinity_and_an_area_of_zero_shut_a_neighbour_out():
 def test_opcheck_without_gradients():
     (pixels, slope, shift, gram, _), image, queries, _ = draw(count=9)
     matrices, rows = torch.randn(3, C, C), torch.randn(4, C)
-    arguments = (pixels, queries, slope, shift, gram, image, matrices, rows, 1, 1e-3, 0.5, 1e-5, True)
+    arguments = (
+        pixels,
+        queries,
+        slope,
+        shift,
+        gram,
+        image,
+        matrices,
+        rows,
+        1,
+        1e-3,
+        0.5,
+        torch.randn(2, 9, 4),
+        1e-5,
+        True,
+    )
     torch.library.opcheck(_fused_decode, arguments)
 
 
