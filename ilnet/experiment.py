@@ -228,12 +228,15 @@ def _frame_time(model: models.Model) -> float:
 
 def prior(study: Study) -> None:
     """Ours: a geometric prior on the weights."""
-    files: dict[str, str | Path] = {"none": study.trained("iln-0", "iln")}
-    files |= {kind: study.trained(f"iln-{kind}", "iln-prior", prior=kind) for kind in ("bilinear", "perspective")}
-    bare = models.load(files["perspective"])
+    bare = models.load(study.trained("iln-prior-0", "iln-prior"))
     assert isinstance(bare, models.ILN)
+    files: dict[str, Path | models.Model] = {"none": study.trained("iln-0", "iln")}
+    for kind in ("bilinear", "perspective", "planes"):
+        label = "iln-prior-0" if kind == bare.prior else f"iln-{kind}"
+        files[kind] = study.trained(label, "iln-prior", prior=kind)
     bare.dead_zone = 0.0
-    rows = [{"prior": row.pop("model"), **row} for row in study.compare({**files, "perspective, no dead zone": bare})]
+    files[f"{bare.prior}, no dead zone"] = bare
+    rows = [{"prior": row.pop("model"), **row} for row in study.compare(files)]
     study.write("prior", rows)
     _bars(study, "prior", rows, "prior", "prior")
 
@@ -248,8 +251,7 @@ def rays(study: Study) -> None:
     rows = []
     for learns_from, archive in (("continuous", None), ("stored", study.archive)):
         for name in ("iln", "iln-prior"):
-            label = {"iln": "iln-0", "iln-prior": "iln-perspective"}[name]
-            file = study.trained(label if archive is None else f"{name}-stored", name, archive=archive)
+            file = study.trained(f"{name}-{0 if archive is None else 'stored'}", name, archive=archive)
             rows += [{"rays": learns_from, **row} for row in study.compare({name: file})]
     study.write("rays", rows)
     _bars(study, "rays", [row for row in rows if row["model"] == "iln"], "rays", "learned from (iln)")

@@ -154,7 +154,9 @@ class Training(lightning.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """Adam; the rate warms up and decays to 0, or is halved now and then."""
-        optimizer = torch.optim.Adam(self.parameters(), lr=self.rate)
+        # While the head of a network with a prior is next to zero, so are the gradients of its encoder: Adam would blow
+        # up their noise, and the features with it, were its eps not above them.
+        optimizer = torch.optim.Adam(self.parameters(), lr=self.rate, eps=1e-6)
         steps = int(self.trainer.estimated_stepping_batches)
         schedule: torch.optim.lr_scheduler.LRScheduler
         if self.halve_after:

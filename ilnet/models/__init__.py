@@ -67,7 +67,7 @@ def create(name: str, **arguments: Any) -> Model:
 
 
 def save(model: Model, path: str | Path, name: str, arguments: dict[str, Any], **card: Any) -> None:
-    """Writes weights with all that is needed to make the model again.
+    """Writes weights in half precision, which no figure shows, with all that is needed to make the model again.
 
     Args:
         model: Whose weights are written.
@@ -78,7 +78,8 @@ def save(model: Model, path: str | Path, name: str, arguments: dict[str, Any], *
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     about = {"name": name, "arguments": {**_MODELS[name][1], **arguments}, **card}
-    weights = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
+    state = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
+    weights = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
     try:
         save_file(weights, path, {key: json.dumps(value) for key, value in about.items()})
     except SafetensorError as error:
