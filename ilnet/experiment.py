@@ -87,11 +87,9 @@ class Study:
         """The networks that are compared with other methods."""
         return {name: self.trained(name, name) if self.preset else name for name in ("liif", "iln", "iln-prior")}
 
-    def compare(
-        self, files: Mapping[str, str | Path | models.Model], sizes: Sequence[tuple[int, int]] = ()
-    ) -> list[dict[str, Any]]:
+    def compare(self, files: Mapping[str, str | Path], sizes: Sequence[tuple[int, int]] = ()) -> list[dict[str, Any]]:
         """Measures models, by the names their rows shall bear, on the test towns; at all `SIZES` unless told."""
-        loaded = {label: f if isinstance(f, models.Model) else models.load(f) for label, f in files.items()}
+        loaded = {label: models.load(file) for label, file in files.items()}
         rows = []
         for size in sizes or SIZES:
             output = evaluate.INPUT.resize(*size)
@@ -228,14 +226,11 @@ def _frame_time(model: models.Model) -> float:
 
 def prior(study: Study) -> None:
     """Ours: a geometric prior on the weights."""
-    bare = models.load(study.trained("iln-prior-0", "iln-prior"))
-    assert isinstance(bare, models.ILN)
-    files: dict[str, Path | models.Model] = {"none": study.trained("iln-0", "iln")}
+    files: dict[str, str | Path] = {"none": study.trained("iln-0", "iln")}
+    usual = models.create("iln-prior")
     for kind in ("bilinear", "perspective", "planes"):
-        label = "iln-prior-0" if kind == bare.prior else f"iln-{kind}"
+        label = "iln-prior-0" if kind == usual.prior else f"iln-{kind}"
         files[kind] = study.trained(label, "iln-prior", prior=kind)
-    bare.dead_zone = 0.0
-    files[f"{bare.prior}, no dead zone"] = bare
     rows = [{"prior": row.pop("model"), **row} for row in study.compare(files)]
     study.write("prior", rows)
     _bars(study, "prior", rows, "prior", "prior")

@@ -3,7 +3,7 @@
     t = z + Wq + b                           per neighbour of the query
     t ← t + O attend(M LN(t))                `kernels.hoisted`
     t ← t + W₂ gelu(W₁ LN(t) + b₁) + b₂
-    s = hᵀ LN(t),   r̂ = Σ_t softmax(s' + p)_t r_t     s' is s, shrunk within a dead zone
+    s = hᵀ LN(t),   r̂ = Σ_t softmax(s + p)_t r_t
 
 A frame of 128×2048 queries has a million tokens of 64 numbers, and the decoder passes over them a dozen times: done one
 operation after the other, it waits for memory. Here a thread takes some queries at a time through all operations; their
@@ -23,7 +23,7 @@ from kernels.lanes import LANES, add_products, gelu, rsqrt, total, vectors
 from kernels.launch import check_backend, launch
 from kernels.neighbour_attention import Projected, head_last
 from kernels.neighbours import area, check_queries
-from kernels.reference import DEAD_SLOPE, PRIORS, RANGE_FLOOR
+from kernels.reference import PRIORS, RANGE_FLOOR
 from kernels.vmap import refuse
 
 __all__ = ["DecoderWeights", "fused_decode", "fused_decode_serves"]
@@ -36,7 +36,6 @@ _GROUP = 16
 _BILINEAR = wp.constant(PRIORS.index("bilinear"))
 _PERSPECTIVE = wp.constant(PRIORS.index("perspective"))
 _RANGE_FLOOR = wp.constant(RANGE_FLOOR)
-_DEAD_SLOPE = wp.constant(DEAD_SLOPE)
 
 _lanes = vectors(LANES, wp.float32)
 
@@ -59,19 +58,6 @@ def _normalise(x: wp.array2d[_lanes], row: int, eps: float, y_out: wp.array2d[_l
     inverse = rsqrt(variance)
     for c in range(x.shape[1]):
         y_out[row, c] = wp.cw_mul(x[row, c] - mean, inverse)
-
-
-@wp.func
-def _shrink(scores: wp.vec4, dead_zone: float):
-    """`kernels.reference.shrink`."""
-    mean = (scores[0] + scores[1] + scores[2] + scores[3]) / 4.0
-    zone = dead_zone * dead_zone
-    shrunk = wp.vec4()
-    for t in range(4):
-        centred = scores[t] - mean
-        square = centred * centred
-        shrunk[t] = centred * (square + _DEAD_SLOPE * zone) / (square + zone)
-    return shrunk
 
 
 @wp.func
@@ -114,7 +100,6 @@ def _fused_decode_kernel(
     biases: wp.array2d[_lanes],
     prior: int,
     area_floor: float,
-    dead_zone: float,
     added: wp.array2d[float],
     share: int,
     group: int,
@@ -172,8 +157,6 @@ def _fused_decode_kernel(
                     score += wp.cw_mul(x_out[i, c], biases[3, c])
                 scores[t] = total(score)[0]
                 ranges[t] = image[pixel[t]]
-            if dead_zone > 0.0:
-                scores = _shrink(scores, dead_zone)
             if added.shape[0] > 0:
                 for t in range(4):
                     scores[t] = scores[t] + added[n, t]
@@ -214,7 +197,6 @@ def _fused_decode(
     biases: torch.Tensor,
     prior: int,
     area_floor: float,
-    dead_zone: float,
     added: torch.Tensor,
     eps: float,
     wrap: bool,
@@ -225,7 +207,7 @@ def _fused_decode(
     tokens, x, h = pixels.new_empty(3, 4 * _GROUP * _WORKERS, channels)
     share = -(-batch * count // _WORKERS)
     first = arguments(pixels, queries, slope, shift, gram, HEADS, eps, wrap)
-    others = [image.reshape(-1), weights, biases, prior, area_floor, dead_zone, added.view(-1, 4), share, _GROUP, x, h]
+    others = [image.reshape(-1), weights, biases, prior, area_floor, added.view(-1, 4), share, _GROUP, x, h]
     launch(_fused_decode_kernel, _WORKERS, [*first, *others], [tokens, x, h, blended.view(-1)], least=1)
     return blended
 
@@ -242,7 +224,6 @@ def _(
     biases: torch.Tensor,
     prior: int,
     area_floor: float,
-    dead_zone: float,
     added: torch.Tensor,
     eps: float,
     wrap: bool,
@@ -262,7 +243,6 @@ def fused_decode(
     wrap: bool = True,
     *,
     area_floor: float = 0.0,
-    dead_zone: float = 0.0,
     added: torch.Tensor | None = None,
     eps: float = 1e-5,
     backend: str = "warp",
@@ -277,8 +257,7 @@ def fused_decode(
         prior: As in `gather_blend`.
         wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
         area_floor: As in `gather_blend`.
-        dead_zone: Within which differences of scores shrink; see `kernels.reference.shrink`. 0 for none.
-        added: (B, Q, 4) to add to the scores after that, such as `plane_prior`.
+        added: (B, Q, 4) to add to the scores, such as `plane_prior`.
         eps: Of the layer norms.
         backend: "warp", or "torch" for the plain twin in `kernels.reference`, which serves any table.
 
@@ -303,9 +282,7 @@ def fused_decode(
     if added is not None and added.shape != (batch, queries.shape[1], 4):
         raise ValueError(f"added has shape {tuple(added.shape)}; it should be {(batch, queries.shape[1], 4)}")
     if backend == "torch":
-        return reference.fused_decode(
-            projected, image, queries, weights, prior, wrap, area_floor, dead_zone, added, eps
-        )
+        return reference.fused_decode(projected, image, queries, weights, prior, wrap, area_floor, added, eps)
     if not fused_decode_serves(projected):
         raise ValueError("projected has no kernel: it should be float32 on a CPU, with 8 heads and C a multiple of 64")
     pixels, slope, shift, gram, heads = projected
@@ -318,6 +295,6 @@ def fused_decode(
         ).float()
         return _fused_decode(
             pixels.contiguous(), queries.to(pixels.dtype).contiguous(), slope, shift, gram, image.float().contiguous(),
-            matrices, rows, PRIORS.index(prior), area_floor, dead_zone,
+            matrices, rows, PRIORS.index(prior), area_floor,
             pixels.new_empty(0, 4) if added is None else added.to(pixels.dtype).contiguous(), eps, wrap,
         )  # fmt: skip

@@ -10,7 +10,6 @@ import torch
 import torch.nn.functional as F
 
 __all__ = [
-    "DEAD_SLOPE",
     "PARTED",
     "PRIORS",
     "RANGE_FLOOR",
@@ -25,7 +24,6 @@ __all__ = [
     "neighbour_attention",
     "neighbours",
     "plane_prior",
-    "shrink",
 ]
 
 PRIORS = ("none", "bilinear", "perspective")
@@ -36,8 +34,6 @@ RANGE_FLOOR = 0.1
 PARTED = 0.03
 # A step that is as sharp or sharper has nothing between.
 SHARPEST = 1e3
-# What is left of a small difference of scores in the dead zone.
-DEAD_SLOPE = 0.1
 
 
 def neighbours(
@@ -172,21 +168,6 @@ def plane_prior(
     return (areas.clamp(min=area_floor) * torch.cat((u, v), -1)).log()
 
 
-def shrink(scores: torch.Tensor, dead_zone: float) -> torch.Tensor:
-    """Lets the scores (..., 4) of the neighbours differ clearly or hardly at all: a prior stands where they hesitate.
-
-        c = s - mean(s),    s' = c (c² + κ d²) / (c² + d²)
-
-    Differences far beyond the dead zone d pass as they are, those within it shrink, down to κ = `DEAD_SLOPE` of
-    themselves: enough of a slope to learn from. d = 0 changes no weight.
-    """
-    if dead_zone == 0:
-        return scores
-    centred = scores - scores.mean(-1, keepdim=True)
-    squares, zone = centred.square(), dead_zone**2
-    return centred * (squares + DEAD_SLOPE * zone) / (squares + zone)
-
-
 def fused_decode(
     projected: Any,
     image: torch.Tensor,
@@ -195,7 +176,6 @@ def fused_decode(
     prior: str,
     wrap: bool,
     area_floor: float,
-    dead_zone: float,
     added: torch.Tensor | None,
     eps: float,
 ) -> torch.Tensor:
@@ -209,7 +189,7 @@ def fused_decode(
     scores = F.linear(
         F.layer_norm(t, bias.shape, weights.head_norm[0], weights.head_norm[1], eps), *weights.score
     ).squeeze(-1)
-    scores = shrink(scores, dead_zone) + (0 if added is None else added)
+    scores = scores if added is None else scores + added
     return gather_blend(image, queries, scores, prior, wrap, area_floor)[0]
 
 

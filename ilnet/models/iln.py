@@ -19,7 +19,7 @@ from kernels import (
     plane_prior,
     project_pixels,
 )
-from kernels.reference import PRIORS, shrink
+from kernels.reference import PRIORS
 
 __all__ = ["ILN"]
 
@@ -83,8 +83,6 @@ class ILN(Model):
         dropout: Rate in the attention blocks while training; the authors' is 0.1.
         area_floor: Least bilinear area in the prior, so that a measured pixel can be overruled.
         sharpness: Of the step that "planes" expects at an edge; soft enough to learn where it is.
-        dead_zone: Differences of scores within which a prior stands, once trained: so small ones are more often noise
-            than knowledge. See `kernels.reference.shrink`.
         norm_range: Metres that the encoder sees as +1; no return is filled with it.
 
     Raises:
@@ -103,7 +101,6 @@ class ILN(Model):
         dropout: float = 0.0,
         area_floor: float = 1e-4,
         sharpness: float = 4.0,
-        dead_zone: float = 0.0,
         norm_range: float = 100.0,
     ):
         if prior not in (*PRIORS, "planes"):
@@ -111,7 +108,7 @@ class ILN(Model):
         if heads < 1 or features % heads:
             raise ValueError(f"heads is {heads}; it should divide the {features} features")
         super().__init__()
-        self.prior, self.area_floor, self.sharpness, self.dead_zone = prior, area_floor, sharpness, dead_zone
+        self.prior, self.area_floor, self.sharpness = prior, area_floor, sharpness
         self.norm_range, self.dropout = norm_range, dropout
         self.encoder = Encoder(features, blocks)
         self.position = nn.Linear(2, features)
@@ -143,10 +140,8 @@ class ILN(Model):
             z, offsets = gather_neighbours(features, queries, wrap, self.backend)
             z = z + self.position(offsets * OFFSET_SCALE)
         elif self.is_fused(encoded):
-            floor, zone, weights = self.area_floor, self.dead_zone, self._decoder_weights()
-            return fused_decode(
-                projected, image, queries, weights, prior, wrap, area_floor=floor, dead_zone=zone, added=planes
-            )
+            floor, weights = self.area_floor, self._decoder_weights()
+            return fused_decode(projected, image, queries, weights, prior, wrap, area_floor=floor, added=planes)
         else:
             first, blocks = self._first(), self.blocks[1:]
             output = first.attention.out.weight, first.attention.out.bias
@@ -155,8 +150,6 @@ class ILN(Model):
         for block in blocks:
             z = block(z, self.backend)
         scores = self.head(z).squeeze(-1).to(image.dtype)
-        if not self.training:
-            scores = shrink(scores, self.dead_zone)
         if planes is not None:
             scores = scores + planes
         return gather_blend(image, queries, scores, prior, wrap, area_floor=self.area_floor, backend=self.backend)

@@ -132,24 +132,6 @@ def test_iln_matches_a_plain_formulation_with_gradients(prior, wrap, depth):
         torch.testing.assert_close(ours, plain, rtol=1e-2, atol=GRADIENT)
 
 
-def test_a_dead_zone_is_for_trained_scores_only():
-    torch.manual_seed(0)
-    model, (image, queries) = models.ILN(prior="perspective", blocks=1, dead_zone=0.5), draw()
-    torch.nn.init.normal_(model.head[1].weight, std=0.1)
-    plain = models.create("iln", prior="perspective", blocks=1)
-    plain.load_state_dict(model.state_dict())
-    assert torch.equal(model(image, queries), plain(image, queries))
-    model.eval(), plain.eval()
-    outside = model(image, queries)  # with gradients: layer by layer
-    with torch.no_grad():
-        fused, without = model(image, queries), plain(image, queries)
-        plain.head[1].weight.zero_()
-        interpolated = plain(image, queries)
-    torch.testing.assert_close(outside, fused, rtol=0, atol=METRES)
-    # A dead zone brings the ranges nearer to the prior's.
-    assert (fused - interpolated).abs().mean() < 0.8 * (without - interpolated).abs().mean()
-
-
 # 2.5 mm of 100 m, after 34 convolutions in another order.
 NORMALISED = 5e-5
 

@@ -52,36 +52,15 @@ def test_is_the_decoder_layer_by_layer(channels, prior, wrap, poisoned):
         torch.testing.assert_close(ranges, expected, rtol=0, atol=METRES)
 
 
-@pytest.mark.parametrize("dead_zone", [0.5, 3.0])
-def test_scores_shrink_in_the_dead_zone(dead_zone):
-    projected, image, queries, weights = draw()
-    plain = fused_decode(projected, image, queries, weights, "perspective", dead_zone=dead_zone, backend="torch")
-    ranges = fused_decode(projected, image, queries, weights, "perspective", dead_zone=dead_zone)
-    torch.testing.assert_close(ranges, plain, rtol=0, atol=METRES)
-    assert not torch.allclose(ranges, fused_decode(projected, image, queries, weights, "perspective"), atol=0.1)
-
-
 def test_scores_may_be_added(poisoned):
     projected, image, queries, weights = draw()
     added = plane_prior(image, queries, area_floor=1e-3)
     ranges, plain = (
-        fused_decode(projected, image, queries, weights, added=added, dead_zone=0.5, backend=backend)
-        for backend in ("warp", "torch")
+        fused_decode(projected, image, queries, weights, added=added, backend=backend) for backend in ("warp", "torch")
     )
     torch.testing.assert_close(ranges, plain, rtol=0, atol=METRES)
     with pytest.raises(ValueError, match=r"added has shape \(2, 500\)"):
         fused_decode(projected, image, queries, weights, added=added[..., 0])
-
-
-def test_shrink_by_hand():
-    scores = torch.tensor([[3.0, 1.0, 1.0, 3.0], [0.02, 0.0, 0.0, 0.02], [7.0, 7.0, 7.0, 7.0], [400.0, 0.0, 0.0, 0.0]])
-    shrunk = reference.shrink(scores, 1.0)
-    # Differences of 1 from the mean, the width of the zone, keep (1 + κ) / 2; small ones κ; none, none; large ones all.
-    torch.testing.assert_close(shrunk[0], torch.tensor([0.55, -0.55, -0.55, 0.55]))
-    torch.testing.assert_close(shrunk[1], torch.tensor([1e-3, -1e-3, -1e-3, 1e-3]), rtol=1e-2, atol=0)
-    assert torch.equal(shrunk[2], torch.zeros(4))
-    torch.testing.assert_close(shrunk[3] - shrunk[3, 1], scores[3], rtol=1e-3, atol=0)
-    assert reference.shrink(scores, 0.0) is scores
 
 
 def test_any_number_of_queries_and_cores():
