@@ -101,7 +101,6 @@ def test_opcheck_without_gradients():
         rows,
         1,
         1e-3,
-        0.5,
         torch.randn(2, 9, 4),
         1e-5,
         True,
