@@ -1,7 +1,12 @@
-"""Writes the notebooks: each source `NN_name.py` is converted and executed, and becomes `NN_name.ipynb`.
+"""Writes the notebooks from their sources.
 
 python notebooks/build.py            all of them
 python notebooks/build.py 00 03      those that start so
+
+A source `NN_name.py` (jupytext, py:percent) becomes two notebooks: the learner's `NN_name.ipynb`, executed, and
+`solutions/NN_name.ipynb`. Tags say which cells are whose. An exercise is a cell tagged `exercise`, which raises
+NotImplementedError, then one tagged `solution`, then one tagged `check`. Cells tagged `wrong` behind them are answers
+that the check has to refuse; only the tests run them.
 """
 
 import sys
@@ -12,25 +17,86 @@ from pathlib import Path
 import jupytext
 import nbformat
 from nbclient import NotebookClient
+from nbformat import NotebookNode
 
 HERE = Path(__file__).parent
+TIMEOUT = 180  # seconds a cell
+
+
+def tagged(cell: NotebookNode, tag: str) -> bool:
+    return tag in cell.metadata.get("tags", ())
+
+
+def exercises(source: Path) -> list[dict[str, list[NotebookNode]]]:
+    """The cells of a source in order, each run of exercise cells as one dictionary by tag."""
+    groups: list[dict[str, list[NotebookNode]]] = []
+    for cell in jupytext.read(source).cells:
+        tag = next((t for t in ("exercise", "solution", "check", "wrong") if tagged(cell, t)), "text")
+        if tag in ("text", "exercise"):
+            groups.append({"text": [], "exercise": [], "solution": [], "check": [], "wrong": []})
+        groups[-1][tag].append(cell)
+    return groups
+
+
+def learner(source: Path) -> NotebookNode:
+    """The notebook with stubs to fill in, each solution folded behind its check."""
+    cells = []
+    for group in exercises(source):
+        cells += group["text"] + group["exercise"] + group["check"]
+        code = "\n\n".join(cell.source for cell in group["solution"])
+        if code:
+            folded = f"<details><summary><b>Solution</b></summary>\n\n```python\n{code}\n```\n\n</details>"
+            cells.append(nbformat.v4.new_markdown_cell(folded))
+    return notebook(source, cells)
+
+
+def solved(source: Path) -> NotebookNode:
+    """The notebook with the solutions in."""
+    return notebook(source, [c for g in exercises(source) for c in g["text"] + g["solution"] + g["check"]])
+
+
+def proof(source: Path) -> NotebookNode:
+    """The solved notebook in which each check, once passed, meets its wrong answers, and then the solution again."""
+    cells = []
+    for group in exercises(source):
+        cells += group["text"] + group["solution"] + group["check"]
+        for wrong in group["wrong"]:
+            refused = [nbformat.v4.new_code_cell(cell.source) for cell in group["check"]]
+            refused[-1].metadata["tags"] = ["raises-exception", "refuses"]
+            cells += [wrong, *refused]
+        if group["wrong"]:
+            cells += [nbformat.v4.new_code_cell(cell.source) for cell in group["solution"]]
+    return notebook(source, cells)
+
+
+def notebook(source: Path, cells: list[NotebookNode]) -> NotebookNode:
+    made = jupytext.read(source)
+    made.cells = cells
+    for number, cell in enumerate(cells):
+        cell.id = f"cell-{number}"  # not random, so that two builds agree
+    made.metadata.pop("jupytext", None)
+    return made
+
+
+def execute(made: NotebookNode, folder: str) -> None:
+    NotebookClient(
+        made,
+        timeout=TIMEOUT,
+        kernel_name="python3",
+        resources={"metadata": {"path": folder}},
+        record_timing=False,  # nor differ in times, nor in how what was printed falls into pieces
+        coalesce_streams=True,
+    ).execute()
 
 
 def build(source: Path) -> None:
-    notebook = jupytext.read(source)
-    for number, cell in enumerate(notebook.cells):
-        cell.id = f"cell-{number}"  # not random, so that two builds agree
+    made = learner(source)
     with tempfile.TemporaryDirectory() as folder:  # a notebook may not rely on where it lies
-        NotebookClient(
-            notebook,
-            timeout=180,
-            kernel_name="python3",
-            resources={"metadata": {"path": folder}},
-            record_timing=False,  # nor differ in times, nor in how what was printed falls into pieces
-            coalesce_streams=True,
-        ).execute()
-    notebook.metadata.pop("jupytext", None)
-    nbformat.write(notebook, source.with_suffix(".ipynb"))
+        execute(made, folder)
+    nbformat.write(made, source.with_suffix(".ipynb"))
+    if any(group["exercise"] for group in exercises(source)):
+        (HERE / "solutions").mkdir(exist_ok=True)
+        nbformat.write(solved(source), HERE / "solutions" / f"{source.stem}.ipynb")
 
 
 if __name__ == "__main__":
