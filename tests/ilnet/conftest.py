@@ -3,6 +3,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from tqdm import tqdm
 
 from ilnet import cli, data, towns
 from kernels import Mesh
@@ -55,6 +56,7 @@ def command(tmp_path, monkeypatch, capsys):
     """Runs a command line in an empty folder and in this process: starting another takes seconds each time."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("GOMP_SPINCOUNT", "3000")
+    tqdm._instances.clear()  # a training that a test cut short left its bar, which others would draw around
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["ilnet", *map(str, arguments)])

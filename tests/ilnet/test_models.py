@@ -444,8 +444,6 @@ def test_bad_weights_are_refused(tmp_path):
         models.load("ilm")
     with pytest.raises(ValueError, match="unknown model 'ilm'"):
         models.create("ilm")
-    with pytest.raises(FileNotFoundError, match="no weights ship for liif"):
-        models.load("liif")
     with pytest.raises(FileNotFoundError, match="no weights ship for lidar-sr; train them"):
         models.load("lidar-sr")
     with pytest.raises(FileNotFoundError, match="no such file of weights"):

@@ -17,6 +17,7 @@ MODULES = [
     "gather_blend",
     "neighbour_attention",
     "neighbours",
+    "plane_prior",
     "projection",
     "raycast",
 ]
