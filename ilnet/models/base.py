@@ -56,7 +56,7 @@ class Model(nn.Module):
         raise NotImplementedError
 
     def is_fused(self, encoded: Any) -> bool:
-        """Whether `decode` holds nothing per query, so that `Upsampler` need not give it tiles."""
+        """Whether `decode` holds next to nothing per query, so that `Upsampler` need not give it tiles."""
         return False
 
     def forward(self, image: torch.Tensor, queries: torch.Tensor, wrap: bool = True) -> torch.Tensor:

@@ -40,4 +40,5 @@ class Planes(Model):
 
     def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Answers queries (B, Q, 2) with ranges (B, Q) [m]."""
-        return gather_blend(image, queries, plane_prior(image, queries, wrap, backend=self.backend), wrap=wrap)
+        scores = plane_prior(image, queries, wrap, backend=self.backend)
+        return gather_blend(image, queries, scores, wrap=wrap, backend=self.backend)
