@@ -101,7 +101,8 @@ class Study:
         """Writes rows of one kind as NAME.csv, and in about.json what they were made with."""
         self.out.mkdir(parents=True, exist_ok=True)
         shipped = self.preset is None and name in ("table", "real")
-        networks = "the networks that ship" if shipped else f"networks trained with preset {self.preset or 'small'}"
+        trained = f"networks trained with preset {self.preset or 'small'}"
+        networks = "the networks that ship (LiDAR-SR: preset small)" if shipped else trained
         about = _about(self.out) | {name: {"networks": networks}}
         (self.out / "about.json").write_text(json.dumps(about, indent=1) + "\n")
         with open(self.out / f"{name}.csv", "w", newline="") as file:

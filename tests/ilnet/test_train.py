@@ -187,6 +187,8 @@ def test_stored_images_are_learned_from(tmp_path, quick, monkeypatch):
         train.train("iln", "paper", tmp_path)
     with pytest.raises(ValueError, match=r"lidar-sr with preset tiny learns from stored images.*16x1024,64x1024"):
         train.train("lidar-sr", "tiny", tmp_path, target=(64, 1024))
+    with pytest.raises(ValueError, match=r"size is 70x1024; for lidar-sr it should be a multiple of 16x1024"):
+        train.train("lidar-sr", "tiny", tmp_path, archive=tmp_path / "data", target=(70, 1024))
     with pytest.raises(FileNotFoundError, match="no such folder"):
         quick(tmp_path / "out2", archive=tmp_path / "nothing")
 
