@@ -1,8 +1,18 @@
-"""What the exercises of the notebooks share."""
+"""What the notebooks of the course share: checks of exercises, and pictures."""
 
-from collections.abc import Callable
+import io
+import os
+from collections.abc import Callable, Sequence
+from html import escape
+from typing import Any, NamedTuple
 
-__all__ = ["check"]
+import PIL.Image
+from IPython.display import HTML, Image
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
+
+__all__ = ["Cells", "check", "draw_thread", "show_scene"]
 
 
 def check(checks: Callable[[], object]) -> None:
@@ -17,3 +27,95 @@ def check(checks: Callable[[], object]) -> None:
         print("Not answered yet: replace the line that raises NotImplementedError, and run both cells again.")
     else:
         print("Right.")
+
+
+def show_scene(plotter: Any) -> HTML | Image:
+    """A PyVista plotter as something to turn with the mouse in a Jupyter session, and as a picture elsewhere.
+
+    Args:
+        plotter: A `pyvista.Plotter` with `off_screen=True`; it is closed.
+
+    Returns:
+        What a cell that ends with this call shows. A picture has 256 colours, so that notebooks stay small.
+    """
+    if "JPY_SESSION_NAME" in os.environ or "VSCODE_PID" in os.environ:  # somebody sits there
+        width, height = plotter.window_size
+        page = escape(plotter.export_html(None).getvalue())
+        plotter.close()
+        # Without a width of its own it shrinks with the page.
+        style = f"width: 100%; max-width: {width}px; height: {height}px; border: 0"
+        return HTML(f'<iframe srcdoc="{page}" style="{style}"></iframe>')
+    pixels = plotter.screenshot()
+    plotter.close()
+    png = io.BytesIO()
+    PIL.Image.fromarray(pixels).quantize(256, PIL.Image.Quantize.MAXCOVERAGE).save(png, "png", optimize=True)
+    return Image(png.getvalue())
+
+
+class Cells(NamedTuple):
+    """An array as a kernel sees it, and the elements that one thread touches."""
+
+    name: str
+    """As in the kernel's signature."""
+    shape: tuple[int, int]
+    """Rows and columns to draw."""
+    touched: Sequence[tuple[int, int]]
+    """(row, column) of each element that the thread reads or writes."""
+
+
+def draw_thread(title: str, reads: Sequence[Cells], steps: str, writes: Sequence[Cells]) -> Figure:
+    """Draws what one thread of a kernel does: what it reads on the left, its steps, what it writes on the right.
+
+    Args:
+        title: Which kernel, and what one thread stands for.
+        reads: Arrays it reads.
+        steps: A few short lines: what happens in registers.
+        writes: Arrays it writes.
+
+    Returns:
+        A figure, for a cell to end with.
+    """
+    height = 0.3 + max(sum(_tall(cells) for cells in arrays) for arrays in (reads, writes))
+    figure = Figure(figsize=(WIDTH, height))
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set(xlim=(0, WIDTH), ylim=(0, height), aspect="equal")
+    axes.axis("off")
+    axes.text(0.1, height - 0.1, title, fontsize=10, va="top")
+    middle, half = (height - 0.3) / 2, 1.15
+    box = FancyBboxPatch((WIDTH / 2 - half, middle - 0.45), 2 * half, 0.9, "round,pad=0.05", fc="#fff3d6", ec="black")
+    axes.add_patch(box)
+    axes.text(WIDTH / 2, middle, steps, ha="center", va="center", fontsize=9)
+    for arrays, colour, side in ((reads, "#0072b2", -1), (writes, "#d55e00", 1)):
+        thread = WIDTH / 2 + side * (half + 0.07), middle
+        top = middle + sum(_tall(cells) for cells in arrays) / 2
+        for cells in arrays:
+            x = 2.6 - CELL * cells.shape[1] if side < 0 else WIDTH - 2.6
+            for end in _draw_cells(axes, cells, colour, x, top, side):
+                ends = (end, thread) if side < 0 else (thread, end)
+                axes.add_patch(FancyArrowPatch(*ends, arrowstyle="-|>", mutation_scale=7, color=colour, alpha=0.6))
+            top -= _tall(cells)
+    return figure
+
+
+# Inches: of the page, and of an element of an array.
+WIDTH, CELL = 9.0, 0.17
+
+
+def _tall(cells: Cells) -> float:
+    return CELL * cells.shape[0] + 0.45
+
+
+def _draw_cells(axes: Axes, cells: Cells, colour: str, x: float, top: float, side: int) -> list[tuple[float, float]]:
+    """One array as a grid below its name; returns where the touched rows meet their arrows."""
+    width = CELL * cells.shape[1]
+    place = {"x": x + width, "ha": "right"} if side < 0 else {"x": x, "ha": "left"}
+    axes.text(y=top - 0.12, s=cells.name, fontsize=9, family="monospace", va="center", **place)
+    ends: dict[int, tuple[float, float]] = {}
+    for row in range(cells.shape[0]):
+        for column in range(cells.shape[1]):
+            corner = x + CELL * column, top - 0.25 - CELL * (row + 1)
+            here = (row, column) in cells.touched
+            axes.add_patch(Rectangle(corner, CELL, CELL, fc=colour if here else "white", ec="#777777", linewidth=0.6))
+            if here and (side < 0 or row not in ends):  # the outermost of its row
+                ends[row] = corner[0] + (CELL if side < 0 else 0), corner[1] + CELL / 2
+    return list(ends.values())

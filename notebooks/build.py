@@ -6,9 +6,12 @@ python notebooks/build.py 00 03      those that start so
 A source `NN_name.py` (jupytext, py:percent) becomes two notebooks: the learner's `NN_name.ipynb`, executed, and
 `solutions/NN_name.ipynb`. Tags say which cells are whose. An exercise is a cell tagged `exercise`, which raises
 NotImplementedError, then one tagged `solution`, then one tagged `check`. Cells tagged `wrong` behind them are answers
-that the check has to refuse; only the tests run them.
+that the check has to refuse; only the tests run them. What the cell tagged `goal` draws becomes the picture at the head
+of the notebook and in the README, `pictures/NN_name.png`.
 """
 
+import base64
+import io
 import sys
 import tempfile
 import time
@@ -16,11 +19,13 @@ from pathlib import Path
 
 import jupytext
 import nbformat
+import PIL.Image
 from nbclient import NotebookClient
 from nbformat import NotebookNode
 
 HERE = Path(__file__).parent
 TIMEOUT = 180  # seconds a cell
+PICTURE_WIDTH = 640  # pixels
 
 
 def tagged(cell: NotebookNode, tag: str) -> bool:
@@ -87,6 +92,22 @@ def execute(made: NotebookNode, folder: str) -> None:
         record_timing=False,  # nor differ in times, nor in how what was printed falls into pieces
         coalesce_streams=True,
     ).execute()
+    # Sliders work where a kernel runs; on paper they are an error message.
+    made.metadata.pop("widgets", None)
+    for cell in made.cells:
+        if cell.cell_type == "code":
+            cell.outputs = [o for o in cell.outputs if "application/vnd.jupyter.widget-view+json" not in o.get("data", {})]
+
+
+def draw_goal(made: NotebookNode, file: Path) -> None:
+    """Writes what the cell tagged `goal` of an executed notebook drew."""
+    [cell] = [cell for cell in made.cells if tagged(cell, "goal")]
+    [drawn] = [output.data["image/png"] for output in cell.outputs if "image/png" in output.get("data", {})]
+    picture = PIL.Image.open(io.BytesIO(base64.b64decode(drawn))).convert("RGB")
+    size = PICTURE_WIDTH, round(picture.height * PICTURE_WIDTH / picture.width)
+    picture = picture.resize(size, PIL.Image.Resampling.LANCZOS).quantize(128, PIL.Image.Quantize.MAXCOVERAGE)
+    file.parent.mkdir(exist_ok=True)
+    picture.save(file, "png", optimize=True)
 
 
 def build(source: Path) -> None:
@@ -94,6 +115,7 @@ def build(source: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:  # a notebook may not rely on where it lies
         execute(made, folder)
     nbformat.write(made, source.with_suffix(".ipynb"))
+    draw_goal(made, HERE / "pictures" / f"{source.stem}.png")
     if any(group["exercise"] for group in exercises(source)):
         (HERE / "solutions").mkdir(exist_ok=True)
         nbformat.write(solved(source), HERE / "solutions" / f"{source.stem}.ipynb")
