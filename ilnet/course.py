@@ -63,7 +63,7 @@ class Cells(NamedTuple):
     """(row, column) of each element that the thread reads or writes."""
 
 
-def draw_thread(title: str, reads: Sequence[Cells], steps: str, writes: Sequence[Cells]) -> Figure:
+def draw_thread(title: str, reads: Sequence[Cells], steps: str, writes: Sequence[Cells]) -> Image:
     """Draws what one thread of a kernel does: what it reads on the left, its steps, what it writes on the right.
 
     Args:
@@ -73,7 +73,7 @@ def draw_thread(title: str, reads: Sequence[Cells], steps: str, writes: Sequence
         writes: Arrays it writes.
 
     Returns:
-        A figure, for a cell to end with.
+        A picture, for a cell to end with.
     """
     height = 0.3 + max(sum(_tall(cells) for cells in arrays) for arrays in (reads, writes))
     figure = Figure(figsize=(WIDTH, height))
@@ -89,12 +89,14 @@ def draw_thread(title: str, reads: Sequence[Cells], steps: str, writes: Sequence
         thread = WIDTH / 2 + side * (half + 0.07), middle
         top = middle + sum(_tall(cells) for cells in arrays) / 2
         for cells in arrays:
-            x = 2.6 - CELL * cells.shape[1] if side < 0 else WIDTH - 2.6
+            x = 2.6 - CELL * cells.shape[1] if side < 0 else WIDTH - 2.4
             for end in _draw_cells(axes, cells, colour, x, top, side):
                 ends = (end, thread) if side < 0 else (thread, end)
                 axes.add_patch(FancyArrowPatch(*ends, arrowstyle="-|>", mutation_scale=7, color=colour, alpha=0.6))
             top -= _tall(cells)
-    return figure
+    png = io.BytesIO()
+    figure.savefig(png, dpi=100)
+    return Image(png.getvalue())
 
 
 # Inches: of the page, and of an element of an array.

@@ -24,7 +24,7 @@ from nbclient import NotebookClient
 from nbformat import NotebookNode
 
 HERE = Path(__file__).parent
-TIMEOUT = 180  # seconds a cell
+TIMEOUT = 600  # seconds a cell, where other things run as well
 PICTURE_WIDTH = 640  # pixels
 
 

@@ -1,0 +1,451 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # 04 · Values
+#
+# ![Range over four columns. The measured pixels jump from 39 m to 23 m between two columns; bilinear interpolation draws
+# a slope between them; LIIF draws a gentler slope that misses both levels by metres.](pictures/04_values.png)
+#
+# **Goal.** You build and train LIIF, a network that predicts the range itself at any direction, and see what it does to
+# an edge and to a wall.
+#
+# **After this notebook you can**
+#
+# - write LIIF (equation 2 of the paper) from an encoder, a gather and an MLP;
+# - train it on rays that no stored image contains, in fifteen lines;
+# - say what a predicted value gets wrong at edges, on flat ground, and early in training.
+#
+# | | |
+# |---|---|
+# | You know | [03 · Between the pixels](03_between_the_pixels.ipynb); what a loss and an optimiser are |
+# | Time | 35 minutes to work through; about a minute to run |
+# | Hardware | any computer; a CUDA GPU is used if there is one |
+
+# %%
+import matplotlib.pyplot as plt
+import torch
+from torch import nn
+
+from ilnet import data, metrics
+from ilnet.course import Cells, check, draw_thread
+from ilnet.models.encoder import Encoder
+from ilnet.sensor import preset
+from kernels import area_blend, gather_neighbours
+
+FAST = True  # False: ten times the steps
+STEPS = 120 if FAST else 1200
+torch.manual_seed(0)
+device = "cuda" if torch.cuda.is_available() else "cpu"
+
+# %% [markdown]
+# ## 1. Predict the value
+#
+# Bilinear interpolation looks at four numbers. A network can look at a whole neighbourhood: an *encoder*, a few
+# convolutions, turns the range image into 64 *features* $\mathbf z$ for each pixel, which describe what is around it.
+# The obvious way to use them is LIIF (Local Implicit Image Function). Each of the four neighbours $t$ of a query says
+# which range it believes in, from its features and from where the query lies relative to it, $\Delta\mathbf q_t$; the
+# areas $S_t$ blend the four opinions:
+#
+# $$\hat r = \sum_{t=1}^{4} \frac{S_t}{S}\; h(\mathbf z_t, \Delta\mathbf q_t) \qquad \text{(paper, equation 2)}$$
+#
+# $h$ is an MLP, the same for all pixels. Nothing says that its values lie near the measured ranges.
+#
+# | equation | line of code | kernel argument |
+# |---|---|---|
+# | $\mathbf z_t,\ \Delta\mathbf q_t$ | `z, offsets = gather_neighbours(features, queries)` | `features: (B, C, H, W)`, `z_out`, `offsets_out` |
+# | $h(\mathbf z_t, \Delta\mathbf q_t)$ | `values = self.h(torch.cat((z, offsets), -1))` | (matrix products, left to torch) |
+# | $\sum_t \frac{S_t}{S}\,(\cdot)$ | `area_blend(values, queries)` | `values: (B, Q)` of 4-vectors, `ranges_out` |
+
+# %%
+draw_thread(
+    "gather_neighbours: one thread, one query",
+    [
+        Cells("features", (5, 9), [(2, 4), (2, 5), (3, 4), (3, 5)]),
+        Cells("queries", (6, 2), [(2, 0), (2, 1)]),
+    ],
+    "locate 4 neighbours\ncopy 64 channels of each\nsubtract coordinates",
+    [
+        Cells("z_out (each 64 channels)", (6, 4), [(2, 0), (2, 1), (2, 2), (2, 3)]),
+        Cells("offsets_out (each 2)", (6, 4), [(2, 0), (2, 1), (2, 2), (2, 3)]),
+    ],
+)
+
+# %% [markdown]
+# *In words: a thread reads its query and the features of two by two pixels, and writes one row of four feature vectors
+# and one row of four offsets.*
+#
+# The network in full. `Encoder` is a residual network of 3×3 convolutions that knows about the seam; ours has 4 blocks
+# instead of the paper's 16, so that it trains while you wait.
+
+
+# %%
+class LIIF(nn.Module):
+    """Ranges [m] of queries (B, Q, 2) in images (B, H, W) [m]."""
+
+    def __init__(self, features=64, hidden=256, norm_range=100.0):
+        super().__init__()
+        self.norm_range = norm_range  # what the network sees, and says, as +1; -1 is 0 m
+        self.encoder = Encoder(features, blocks=4)
+        layers = [nn.Linear(features + 2, hidden), nn.ReLU()]
+        for _ in range(3):
+            layers += [nn.Linear(hidden, hidden), nn.ReLU()]
+        self.h = nn.Sequential(*layers, nn.Linear(hidden, 1))
+
+    def forward(self, image, queries, wrap=True):
+        features = self.encoder(image[:, None] * (2 / self.norm_range) - 1, wrap)  # (B, 64, H, W)
+        z, offsets = gather_neighbours(features, queries, wrap)  # (B, Q, 4, 64), (B, Q, 4, 2)
+        values = self.h(torch.cat((z, offsets), -1)).squeeze(-1)  # (B, Q, 4)
+        return (area_blend(values, queries) + 1) * (self.norm_range / 2)
+
+
+print(f"{sum(p.numel() for p in LIIF().parameters()):,} parameters")
+
+# %% [markdown]
+# ### Exercise 1 · Blend by areas
+#
+# ★☆☆ · 5 minutes
+#
+# Write what `area_blend` does: from values (..., Q, 4) and queries (..., Q, 2), the sum of the values weighted by the
+# bilinear areas of notebook 03. It must work for a batch as well as for one image.
+#
+# <details><summary>Hint</summary>
+#
+# `f, g = (queries - queries.floor()).unbind(-1)`; both have the shape (..., Q).
+# </details>
+
+
+# %% tags=["exercise"]
+def my_area_blend(values, queries):
+    raise NotImplementedError
+
+
+# %% tags=["solution"]
+def my_area_blend(values, queries):
+    f, g = (queries - queries.floor()).unbind(-1)
+    areas = torch.stack([(1 - f) * (1 - g), (1 - f) * g, f * (1 - g), f * g], -1)
+    return (areas * values).sum(-1)
+
+
+# %% tags=["check"]
+@check
+def _():
+    values = torch.arange(24.0).view(2, 3, 4) ** 2
+    queries = torch.tensor([[[0.25, 3.5], [2.0, 7.0], [1.5, 0.125]]]).expand(2, 3, 2)
+    mine = my_area_blend(values, queries)
+    assert mine.shape == (2, 3), f"one number for each query of each image: (2, 3), not {tuple(mine.shape)}"
+    assert torch.allclose(mine[:, 1], values[:, 1, 0]), "on the centre of a pixel its own value is wanted"
+    ones = my_area_blend(torch.ones(2, 3, 4), queries)
+    assert torch.allclose(ones, torch.ones(2, 3)), f"four values of 1 blend to 1; you have {ones[0].tolist()}"
+    wanted = area_blend(values, queries)
+    assert torch.allclose(mine, wanted), f"the library has {wanted[0].tolist()}, you have {mine[0].tolist()}: the order?"
+
+
+# %% tags=["wrong"]
+def my_area_blend(values, queries):
+    f, g = (queries - queries.floor()).unbind(-1)
+    areas = torch.stack([f * g, f * (1 - g), (1 - f) * g, (1 - f) * (1 - g)], -1)
+    return (areas * values).sum(-1)
+
+
+# %% tags=["wrong"]
+def my_area_blend(values, queries):
+    return values.mean(-1)
+
+
+# %% tags=["wrong"]
+def my_area_blend(values, queries):
+    f, g = (queries - queries.floor()).unbind(-1)
+    areas = torch.stack([(1 - f) * (1 - g), f * (1 - g), (1 - f) * g, f * g], -1)
+    return (areas * values).sum(-1)
+
+
+# %% [markdown]
+# ## 2. Rays to learn from
+#
+# The paper trains on pixels of stored images of 128 × 2048. We have the world itself: `ContinuousRays` draws a street, a
+# place, a crop of 64 columns of the 16-beam image there, and casts rays at *random directions* between its pixels. No
+# two batches are alike, and no resolution is built in.
+
+# %%
+streets = [data.street(name, device=device) for name in ("town01", "town02")]
+SENSOR = preset("paper-16x1024")
+batch = next(iter(data.ContinuousRays(streets, SENSOR, crops=4, columns=64, queries=512, seed=0)))
+print("images ", tuple(batch.image.shape), "queries", tuple(batch.queries.shape), "ranges", tuple(batch.ranges.shape))
+
+figure, axis = plt.subplots(figsize=(9, 2.6), layout="constrained")
+shown = axis.imshow(batch.image[0].cpu(), cmap="viridis_r", vmin=0, vmax=50, origin="lower", aspect="auto")
+rows, columns = batch.queries[0].cpu().T
+axis.scatter(columns, rows, c=batch.ranges[0].cpu(), cmap="viridis_r", vmin=0, vmax=50, s=14, edgecolors="white", lw=0.4)
+axis.set(xlabel="column", ylabel="row", title="a crop, and the 512 rays that are asked between its pixels")
+figure.colorbar(shown, label="range [m]")
+plt.show()
+
+# %% [markdown]
+# *In words: a coarse range image of 16 by 64 pixels with small circles strewn over it. Most circles have the colour of
+# the pixels they lie on; near outlines some do not.*
+#
+# ## 3. Train it
+#
+# The loss is L1, the mean absolute error in metres. On the way we measure the network on two scans of a town that it is
+# not trained in: what would a sensor of 64 beams have seen?
+#
+# **Predict:** `bilinear` has an IoU of about 0.3 on these scans. How far does the network get in so short a training?
+
+# %%
+# Two places of another town, each with its own traffic.
+pairs = data.held_out_scans(data.street("town05", device=device), 2, [SENSOR, preset("paper-64x1024")])
+
+
+@torch.no_grad()
+def judge(predict):
+    """Mean MAE [m], IoU and share of floating points of predict(image, queries) on the held-out scans."""
+    found = metrics.ScanMetrics().to(device)
+    for scan, truth in pairs:
+        queries = SENSOR.grid_queries(truth.sensor).view(1, -1, 2).to(device)
+        ranges = predict(scan.filled()[None], queries).view(truth.ranges.shape)
+        found.update(ranges, truth)
+    return {name: value.item() for name, value in found.compute().items()}
+
+
+def train(model, steps, rate=1e-3, validations=6):
+    """Trains on rays at continuous directions; returns what `judge` said on the way, by step."""
+    optimizer = torch.optim.Adam(model.parameters(), rate)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps)
+    batches = data.ContinuousRays(streets, SENSOR, crops=4, columns=64, queries=512, seed=0)
+    curve = {}
+    for step, batch in zip(range(1, steps + 1), batches, strict=False):
+        image, queries, ranges = (t.to(device) for t in (batch.image, batch.queries, batch.ranges))
+        loss = (model(image, queries, batch.wrap) - ranges).abs().mean()  # metres
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        if step % (steps // validations) == 0:
+            curve[step] = judge(model)
+            print(f"step {step:4}: MAE {curve[step]['mae']:5.2f} m, IoU {curve[step]['iou']:.3f}")
+    return curve
+
+
+liif = LIIF().to(device)
+curve = train(liif, STEPS)
+assert curve[STEPS]["mae"] < curve[STEPS // 6]["mae"]
+
+# %% [markdown]
+# And a blend without any training, on the same scans. `blend` is what you know from notebook 03, with zero scores.
+
+# %%
+from kernels import gather_blend  # noqa: E402
+
+
+def blend(image, queries):
+    return gather_blend(image, queries, image.new_zeros(*queries.shape[:2], 4), "bilinear")
+
+
+untrained = judge(blend)
+print(f"bilinear: MAE {untrained['mae']:5.2f} m, IoU {untrained['iou']:.3f}")
+print(f"    LIIF: MAE {curve[STEPS]['mae']:5.2f} m, IoU {curve[STEPS]['iou']:.3f}")
+if FAST:
+    assert curve[STEPS]["iou"] < untrained["iou"]
+
+# %% [markdown]
+# In IoU, the share of 10 cm cubes that are right, the trained network is far behind a formula that is centuries old.
+# Why?
+#
+# ## 4. What it does to a wall
+#
+# A blend gets a wall right for nothing: its neighbours lie on it. LIIF has to *say* a range such as 14.32 m, from
+# features, to within centimetres. We take queries whose four neighbours agree to 0.2 m and look how far each method is
+# off there, and how often LIIF says a range outside of the span of its neighbours.
+
+# %%
+scan, truth = pairs[0]
+image = scan.filled()[None]
+queries = SENSOR.grid_queries(truth.sensor).view(1, -1, 2).to(device)
+with torch.no_grad():
+    predicted = {"bilinear": blend(image, queries)[0], "liif": liif.eval()(image, queries)[0]}
+r = gather_neighbours(image[:, None], queries)[0][0, ..., 0]  # (Q, 4), ranges gathered like features
+true = truth.filled().view(-1)
+low, high = r.amin(-1), r.amax(-1)
+flat = (high - low < 0.2) & (true < 80)
+for name, ranges in predicted.items():
+    error = (ranges - true)[flat].abs()
+    print(f"{name:>9}, flat places: median error {100 * error.median():6.1f} cm, within 10 cm {(error < 0.1).float().mean():.0%}")
+outside = (predicted["liif"] < low) | (predicted["liif"] > high)
+print(f"LIIF is outside of the span of its neighbours at {outside[flat].float().mean():.0%} of them")
+if FAST:
+    assert ((predicted["liif"] - true)[flat].abs() < 0.1).float().mean() < 0.8
+
+# %% [markdown]
+# ### Exercise 2 · Outside of the span
+#
+# ★★☆ · 10 minutes
+#
+# Write `share_outside(predicted, r, tolerance)`: the share of predictions (Q,) that lie more than `tolerance` metres
+# below the smallest or above the largest of their neighbours r (Q, 4). A share of no queries is 0.
+#
+# <details><summary>Hint</summary>
+#
+# `low - tolerance` and `high + tolerance` are the bounds. `max(count, 1)` divides safely.
+# </details>
+
+
+# %% tags=["exercise"]
+def share_outside(predicted, r, tolerance):
+    raise NotImplementedError
+
+
+# %% tags=["solution"]
+def share_outside(predicted, r, tolerance):
+    out = (predicted < r.amin(-1) - tolerance) | (predicted > r.amax(-1) + tolerance)
+    return out.sum().item() / max(len(out), 1)
+
+
+# %% tags=["check"]
+@check
+def _():
+    r = torch.tensor([[10.0, 10, 12, 12]]).expand(5, 4)
+    predicted = torch.tensor([9.8, 9.4, 11.0, 12.3, 13.0])
+    share = share_outside(predicted, r, 0.5)
+    assert abs(share - 0.8) > 1e-6, "0.3 m beyond the largest neighbour is within a tolerance of 0.5 m"
+    assert abs(share - 0.4) < 1e-6, f"two of five are out, 9.4 m and 13 m; you have {share:.2f}"
+    assert abs(share_outside(predicted, r, 0.0) - 0.8) < 1e-6, "without tolerance all but 11 m are out"
+    assert share_outside(torch.zeros(0), torch.zeros(0, 4), 0.5) == 0, "no queries: the share is 0"
+
+
+# %% tags=["wrong"]
+def share_outside(predicted, r, tolerance):
+    out = (predicted < r.amin(-1)) | (predicted > r.amax(-1))
+    return out.sum().item() / max(len(out), 1)
+
+
+# %% tags=["wrong"]
+def share_outside(predicted, r, tolerance):
+    return ((predicted > r.amax(-1) + tolerance).sum() / max(len(r), 1)).item()
+
+
+# %% tags=["wrong"]
+def share_outside(predicted, r, tolerance):
+    return ((predicted - r.mean(-1)).abs() > tolerance).sum().item() / max(len(r), 1)
+
+
+# %% [markdown]
+# ## 5. What it does to an edge
+#
+# We take the strongest upright edges of the scan again, as in notebook 03, and let the query walk from one column to the
+# next across each.
+#
+# **Predict:** the MLP is a continuous function of the offset. How will its answer look beside the jump of the truth?
+
+# %%
+street = data.street("town05", device=device)
+one, other = scan.ranges[:, :-1], scan.ranges[:, 1:]
+agree = (one.diff(dim=0).abs() < 0.5) & (other.diff(dim=0).abs() < 0.5)
+cell = torch.stack((one[:-1], other[:-1], one[1:], other[1:]))
+jump = (cell.amax(0) - cell.amin(0)).where(agree & (cell > 0).all(0) & (cell < 40).all(0), 0.0)
+row, column = divmod(int(jump.argmax()), jump.shape[1])
+
+parts = torch.linspace(-1, 2, 121)  # from a column before the edge to one behind it
+walk = torch.stack((torch.full_like(parts, row + 0.5), column + parts), -1)[None].to(device)
+with torch.no_grad():
+    ramp = {"liif": liif(image, walk)[0].cpu(), "bilinear": blend(image, walk)[0].cpu()}
+near, far = (image[0, row : row + 2, column + side].mean().item() for side in (0, 1))
+print(f"the edge: {near:.1f} m on one side, {far:.1f} m on the other")
+
+# %% tags=["goal"]
+figure, axis = plt.subplots(figsize=(9, 3.2), layout="constrained")
+for (name, line), style, colour in zip(ramp.items(), ("-", "--"), ("#d55e00", "#999999"), strict=True):
+    axis.plot(parts, line, style, color=colour, linewidth=2, label=name)
+measured = image[0, row : row + 2, column - 1 : column + 3].cpu()
+for values, marker in zip(measured, "v^", strict=True):
+    axis.plot(range(-1, 3), values, marker, color="black", markersize=7, linestyle="")
+axis.plot([], [], "k^", linestyle="", label="measured pixels, the rows below and above")
+axis.set(xlabel="columns from the edge's first", ylabel="range [m]", xticks=range(-1, 3))
+axis.legend(frameon=False)
+plt.show()
+
+# %% [markdown]
+# *In words: range over four columns. Black triangles, the measured pixels, lie on two levels with one jump between.
+# Between the two columns of the jump, LIIF (solid) runs along a slope as bilinear interpolation (dashed) does, and it
+# misses the measured levels on both sides.*
+#
+# The truth would be a step somewhere between the two columns. A smooth function of the offset cannot jump; to come near
+# a jump, $h$ has to learn very steep slopes. So LIIF makes flying points like the formula it was to replace, and is off
+# beside the edge as well.
+#
+# ### Exercise 3 · A value has no hull
+#
+# ★★☆ · 10 minutes
+#
+# Suppose $h$ were *perfect* on its own side: each neighbour says the true range of the surface that it lies on, near
+# $n$ or far $f$, and the left two neighbours lie on the near one. The areas blend these opinions. Write
+# `perfect_liif(near, far, g)`, what LIIF then says for a query with the fraction $g$ (Q,) of the way from the left column to
+# the right one. (In words for yourself: does a perfect $h$ help?)
+#
+# <details><summary>Hint</summary>
+#
+# The two left areas sum to $1 - g$, whatever the row.
+# </details>
+
+
+# %% tags=["exercise"]
+def perfect_liif(near, far, g):
+    raise NotImplementedError
+
+
+# %% tags=["solution"]
+def perfect_liif(near, far, g):
+    return (1 - g) * near + g * far
+
+
+# %% tags=["check"]
+@check
+def _():
+    g = torch.tensor([0.0, 0.25, 0.5, 1.0])
+    said = torch.as_tensor(perfect_liif(10.0, 30.0, g))
+    assert said.shape == (4,), f"one range for each g: (4,), not {tuple(said.shape)}"
+    assert abs(said[0] - 10) < 1e-5, f"at g = 0 the left neighbours have all the area: 10 m, not {said[0]}"
+    assert abs(said[3] - 30) < 1e-5, f"at g = 1 the right neighbours have all the area: 30 m, not {said[3]}"
+    assert abs(said[1] - 15) < 1e-5, f"at g = 0.25 a quarter of the area is far: 15 m, not {said[1]:.1f} m"
+    assert abs(said[2] - 20) < 1e-5, f"half way the answer floats half way, at 20 m; you have {said[2]:.1f} m"
+
+
+# %% tags=["wrong"]
+def perfect_liif(near, far, g):
+    return torch.where(g < 0.5, near, far)
+
+
+# %% tags=["wrong"]
+def perfect_liif(near, far, g):
+    return g * near + (1 - g) * far
+
+
+# %% tags=["wrong"]
+def perfect_liif(near, far, g):
+    return 1 / ((1 - g) / near + g / far)
+
+
+# %% [markdown]
+# Even with perfect opinions the areas smear the edge. LIIF can only do better if each neighbour also learns what the
+# *other* side says, and when to say it.
+#
+# ## Summary
+#
+# 1. LIIF predicts a value for each neighbour and blends the values by area.
+# 2. It has to learn even the range of a flat wall to the centimetre, which a blend of measurements gets for nothing. Early in
+#    training it does worse than a formula.
+# 3. At an edge it draws a slope, and its values may leave the span of what was measured.
+#
+# ## Next
+#
+# [05 · Weights](05_weights.ipynb): the same encoder, the same rays, the same number of steps, but the network
+# answers another question.
