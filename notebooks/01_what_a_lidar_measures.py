@@ -678,7 +678,7 @@ assert (number > 1).float().mean() > 0.1
 #
 # Write `into_image(points, sensor)`: from points (N, 3) of the sensor's frame the range image, shape `sensor.shape`. A
 # point goes to the pixel nearest to its pixel coordinate; points out of view are dropped; of several points in one
-# pixel the nearest stays; a pixel without a point is 0. The cell before the last has most of the steps. All sensors
+# pixel the nearest stays; a pixel without a point is 0. The code cell above has most of the steps. All sensors
 # here go full circle.
 #
 # <details><summary>Hint</summary>
