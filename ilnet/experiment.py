@@ -226,12 +226,13 @@ def _frame_time(model: models.Model) -> float:
 
 
 def prior(study: Study) -> None:
-    """Ours: a geometric prior on the weights."""
+    """Ours: a geometric prior on the weights, and more weight on small errors (`train.FLATS`)."""
+    usual = models.create("iln-prior").prior
     files: dict[str, str | Path] = {"none": study.trained("iln-0", "iln")}
-    usual = models.create("iln-prior")
+    files["none, small errors"] = study.trained("iln-flats", "iln", flats=train.FLATS["iln-prior"])
     for kind in ("bilinear", "perspective", "planes"):
-        label = "iln-prior-0" if kind == usual.prior else f"iln-{kind}"
-        files[kind] = study.trained(label, "iln-prior", prior=kind)
+        files[kind] = study.trained(f"iln-{kind}", "iln-prior", prior=kind, flats=0.0)
+    files[f"{usual}, small errors"] = study.trained("iln-prior-0", "iln-prior")
     rows = [{"prior": row.pop("model"), **row} for row in study.compare(files)]
     study.write("prior", rows)
     _bars(study, "prior", rows, "prior", "prior")

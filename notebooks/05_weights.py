@@ -142,7 +142,7 @@ def softmax_blend(r, s):
 
 # %%
 SENSOR = preset("paper-16x1024")
-pairs = data.held_out_scans(data.street("town05", device=device), 2, [SENSOR, preset("paper-64x1024")])
+pairs = data.held_out_scans(data.street("town05", device=device), 1, [SENSOR, preset("paper-64x1024")])
 scan, truth = pairs[0]
 image = scan.filled()[None]  # (1, 16, 1024)
 queries = SENSOR.grid_queries(truth.sensor).view(1, -1, 2).to(device)  # every pixel of the 64 x 1024 image
@@ -151,9 +151,9 @@ low, high = r.amin(-1), r.amax(-1)
 
 noise = 5 * torch.randn(1, queries.shape[1], 4, generator=torch.Generator().manual_seed(0)).to(device)
 blended = gather_blend(image, queries, noise)[0]
-agree = high - low < 0.1
 true = truth.filled().view(-1)
-print(f"{agree.float().mean():.0%} of the queries have neighbours that agree to 10 cm")
+agree = (high - low < 0.1) & (true < 80)  # and something is there
+print(f"{agree.float().mean():.0%} of the queries see something and have neighbours that agree to 10 cm")
 print(f"random scores: median error there {100 * (blended - true)[agree].abs().median():.1f} cm")
 assert ((blended >= low - 1e-4) & (blended <= high + 1e-4)).all()
 assert (blended - true)[agree].abs().median() < 0.1
@@ -280,7 +280,7 @@ streets = [data.street(name, device=device) for name in ("town01", "town02")]
 
 @torch.no_grad()
 def judge(model):
-    """Mean MAE [m], IoU and share of floating points on the two held-out scans."""
+    """MAE [m], IoU and share of floating points on the held-out scan."""
     found = metrics.ScanMetrics().to(device)
     for scan, truth in pairs:
         found.update(model(scan.filled()[None], queries).view(truth.ranges.shape), truth)
@@ -291,7 +291,7 @@ def train(model, steps, rate=1e-3, validations=4):
     """Trains on rays at continuous directions; returns what `judge` said on the way, by step."""
     optimizer = torch.optim.Adam(model.parameters(), rate)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps)
-    batches = data.ContinuousRays(streets, SENSOR, crops=4, columns=64, queries=512, seed=0)
+    batches = data.ContinuousRays(streets, SENSOR, crops=4, columns=64, queries=384, seed=0)
     curve = {0: judge(model)}
     for step, batch in zip(range(1, steps + 1), batches, strict=False):
         crops, asked, ranges = (t.to(device) for t in (batch.image, batch.queries, batch.ranges))
