@@ -456,8 +456,9 @@ plt.show()
 # The spread behind `±` is large: ±0.1 in IoU, while methods are 0.04 apart. With eight scans the standard error of a
 # mean is its spread over $\sqrt 8$. Is `iln-prior` better than `iln`, then?
 #
-# **Predict:** the two figures below show the same numbers. On the left each method's mean with its standard error. On
-# the right the *differences on the same scan*, mean and standard error of those. Which bars are shorter, and why?
+# **Predict:** the next figure shows the same numbers twice. On the left each method's mean with its standard error.
+# Beside it the *differences to `iln` on the same scan*, mean and standard error of those. Which bars are shorter, and
+# why?
 
 # %%
 found = table["64x1024"]
