@@ -756,6 +756,7 @@ def steps_to_reach(steps, values, target):  # trusts the order
 # **Predict:** for whom is the wide field of view worse, for LIIF or for ILN? And in the hall?
 
 # %%
+stands = ((0, 0, 0), (-12, 0.5, 0.6), (12, -0.5, 2.0), (3, 0, 4))  # in the hall: x, y [m], yaw [rad]
 
 
 def box(low, high):
@@ -791,7 +792,6 @@ for street in streets.values():
         pose = street.pose(number)
         places.append((street.world(pose[:3, 3], number), pose))
 inside = hall()
-stands = ((0, 0, 0), (-12, 0.5, 0.6), (12, -0.5, 2.0), (3, 0, 4))  # x, y [m], yaw [rad]
 halls = [(inside, simulate.pose((x, y, 1.8), yaw)) for x, y, yaw in stands]
 conditions = {
     "as trained\n±15°": [pair(*place, 15) for place in places],
