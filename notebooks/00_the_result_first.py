@@ -14,7 +14,8 @@
 # # 00 · The result first
 #
 # ![Four range images of the same street, one above the other: 16 coarse rows; bilinear interpolation, in which cars and
-# trunks have smeared edges; the network, in which edges are sharp; and the true scan.](pictures/00_the_result_first.png)
+# trunks have smeared edges; the network, in which edges are sharp; and the true
+# scan.](pictures/00_the_result_first.png)
 #
 # **Goal.** You make a LiDAR scan of 16 beams eight times as dense, in a minute and before you know how, and see what is
 # wrong with the obvious way of doing it. The other notebooks explain every step.
@@ -92,9 +93,10 @@ figure.colorbar(shown, ax=list(axes), label="range [m]", fraction=0.02, pad=0.01
 plt.show()
 
 # %% [markdown]
-# *In words: four range images, 120 degrees of each; near is yellow-green, far is dark blue, no return white. The measured
-# one is made of 16 broad stripes. In the bilinear one, things have blurred outlines, green where yellow meets blue. In
-# the network's, outlines are sharp though a little ragged. The truth has thin trunks, poles and cars with windows.*
+# *In words: four range images, 120 degrees of each; near is yellow-green, far is dark blue, no return white. The
+# measured one is made of 16 broad stripes. In the bilinear one, things have blurred outlines, green where yellow meets
+# blue. In the network's, outlines are sharp though a little ragged. The truth has thin trunks, poles and cars with
+# windows.*
 #
 # ## 3. Where it smears
 #
@@ -123,8 +125,8 @@ plt.show()
 # at 13 m. Along the car the bilinear line (grey triangles) keeps three metres behind it, in the air between car and
 # wall. The network's dots lie on the car, though they jump to it a little too late.*
 #
-# A range half way between a car and the wall behind it is a point in empty air: a *flying point*. A robot brakes for it.
-# Seen as points, from above and behind (in a running notebook: turn it with the mouse):
+# A range half way between a car and the wall behind it is a point in empty air: a *flying point*. A robot brakes for
+# it. Seen as points, from above and behind (in a running notebook: turn it with the mouse):
 
 # %%
 plotter = pyvista.Plotter(off_screen=True, shape=(1, 3), window_size=(1080, 420), border=False)
@@ -163,8 +165,8 @@ assert found["iln-prior"]["floating"] < 0.6 * found["bilinear"]["floating"]
 
 # %% [markdown]
 # The network wins in all three. It did not invent anything: each of its ranges is a *blend* of the four measured
-# neighbours, like bilinear interpolation. What it learned is **how much to trust each of them.** That is the idea of the
-# paper that this course is about: a network that predicts *weights*, where others predict *values*.
+# neighbours, like bilinear interpolation. What it learned is **how much to trust each of them.** That is the idea of
+# the paper that this course is about: a network that predicts *weights*, where others predict *values*.
 #
 # ### Exercise 1 · A size of your own
 #
@@ -198,7 +200,9 @@ def upsample_to(scan, rows, columns):
 def _():
     odd = upsample_to(sparse, 40, 600)
     assert hasattr(odd, "sensor"), f"a Scan is wanted, with its sensor; you return a {type(odd).__name__}"
-    assert tuple(odd.ranges.shape) == (40, 600), f"40 rows and 600 columns were asked for, not {tuple(odd.ranges.shape)}"
+    assert tuple(odd.ranges.shape) == (40, 600), (
+        f"40 rows and 600 columns were asked for, not {tuple(odd.ranges.shape)}"
+    )
     assert np.allclose(odd.sensor.elevations[[0, -1]], sparse.sensor.elevations[[0, -1]]), "the field of view changed"
     same = upsample_to(sparse, 16, 1024)
     off = (same.ranges - sparse.ranges)[sparse.ranges > 0].abs().median()
@@ -231,7 +235,8 @@ def upsample_to(scan, rows, columns):
 #
 # <details><summary>Hint</summary>
 #
-# `seen = true > 0` picks the pixels. The mean of `True` and `False` as numbers is a share; the mean of nothing is `nan`.
+# `seen = true > 0` picks the pixels. The mean of `True` and `False` as numbers is a share; the mean of nothing is
+# `nan`.
 # </details>
 
 
@@ -283,8 +288,8 @@ def share_within(predicted, true, metres):
 # ★★☆ · 15 minutes
 #
 # Along a row, a prediction flies if it is farther than `gap` metres from *both* true ranges between which it lies:
-# write `flying(predicted, near, far, gap)`. It returns a mask (N,): whether `predicted` (N,) lies above `near + gap` and
-# below `far - gap`, with `near` and `far` (N,) the ranges of the two surfaces in any order.
+# write `flying(predicted, near, far, gap)`. It returns a mask (N,): whether `predicted` (N,) lies above `near + gap`
+# and below `far - gap`, with `near` and `far` (N,) the ranges of the two surfaces in any order.
 #
 # <details><summary>Hint</summary>
 #

@@ -14,7 +14,8 @@
 # # 03 · Between the pixels
 #
 # ![Two line charts. On a road the truth and the perspective blend lie on one curve, the bilinear blend bends away above
-# it. At an edge the truth jumps from near to far, and both blends climb slowly across the gap.](pictures/03_between_the_pixels.png)
+# it. At an edge the truth jumps from near to far, and both blends climb slowly across the
+# gap.](pictures/03_between_the_pixels.png)
 #
 # **Goal.** You ask a scan for directions that its sensor did not measure, answer by blending the four pixels around
 # them, and find out where no fixed blend can be right.
@@ -413,7 +414,7 @@ def draw_edge(edge=0.6, offset=0.4):
     query = torch.tensor([[0.5, offset]])
     found = {prior: gather_blend(pair, query, torch.zeros(1, 4), prior, False).item() for prior in list(COLOURS)[:2]}
     found["truth"] = near if offset < edge else far
-    figure, axes = plt.subplots(figsize=(9, 2.6), layout="constrained")
+    axes = plt.figure(figsize=(9, 2.6), layout="constrained").subplots()
 
     def place(r, part):
         angle = (0.5 - part) * apart
@@ -445,7 +446,7 @@ draw_edge()
 # **Predict:** for which edges is a blend right? Then move the sliders (in a running notebook).
 
 # %%
-interact(draw_edge, edge=(0.0, 1.0, 0.05), offset=(0.0, 1.0, 0.05));
+_ = interact(draw_edge, edge=(0.0, 1.0, 0.05), offset=(0.0, 1.0, 0.05))
 
 # %% [markdown]
 # The position of the edge moves nothing but the truth: **the four numbers do not contain it.** A blend that knows only
@@ -457,7 +458,9 @@ interact(draw_edge, edge=(0.0, 1.0, 0.05), offset=(0.0, 1.0, 0.05));
 
 # %%
 generator = torch.Generator().manual_seed(1)
-asked = [across(int(r), int(c), torch.rand(1, generator=generator)) for r, c in zip(edge_rows, edge_columns, strict=True)]
+asked = [
+    across(int(r), int(c), torch.rand(1, generator=generator)) for r, c in zip(edge_rows, edge_columns, strict=True)
+]
 truth = torch.cat([case["truth"] for case in asked])
 neighbours = torch.cat([case["neighbours"] for case in asked])
 blends = torch.stack([torch.cat([case[prior] for case in asked]) for prior in ("bilinear", "perspective")])
@@ -473,16 +476,16 @@ assert (errors["the best of the neighbours"] < 0.5).sum() > 80
 
 # %% [markdown]
 # At most edges the right answer was there all the time: one of the four neighbours has it. So the question is not
-# *which value?* but **which neighbour, how much?** That is what scores are for. Softmax turns them into weights: a score
-# that is larger by 5 gets a weight 150 times as large.
+# *which value?* but **which neighbour, how much?** That is what scores are for. Softmax turns them into weights: a
+# score that is larger by 5 gets a weight 150 times as large.
 #
 # ### Exercise 3 · Be the network
 #
 # ★★☆ · 10 minutes
 #
 # Write `choose(r, truth)`: scores (Q, 4) for which `gather_blend` *without* a prior comes within 0.1 m of the neighbour
-# that is closest to the truth, from the ranges r (Q, 4) and the truth (Q,). A network has to guess what you may look up.
-# Ranges are below 100 m, so a weight of $10^{-4}$ on a wrong neighbour is still 1 cm.
+# that is closest to the truth, from the ranges r (Q, 4) and the truth (Q,). A network has to guess what you may look
+# up. Ranges are below 100 m, so a weight of $10^{-4}$ on a wrong neighbour is still 1 cm.
 #
 # <details><summary>Hint</summary>
 #

@@ -13,8 +13,8 @@
 # %% [markdown]
 # # 04 · Values
 #
-# ![Range over four columns. The measured pixels jump from 39 m to 23 m between two columns; bilinear interpolation draws
-# a slope between them; LIIF draws a gentler slope that misses both levels by metres.](pictures/04_values.png)
+# ![Range over four columns. The measured pixels jump from 39 m to 23 m between two columns; bilinear interpolation
+# draws a slope between them; LIIF draws a gentler slope that misses both levels by metres.](pictures/04_values.png)
 #
 # **Goal.** You build and train LIIF, a network that predicts the range itself at any direction, and see what it does to
 # an edge and to a wall.
@@ -40,7 +40,7 @@ from ilnet import data, metrics
 from ilnet.course import Cells, check, draw_thread
 from ilnet.models.encoder import Encoder
 from ilnet.sensor import preset
-from kernels import area_blend, gather_neighbours
+from kernels import area_blend, gather_blend, gather_neighbours
 
 FAST = True  # False: ten times the steps
 STEPS = 120 if FAST else 1200
@@ -147,7 +147,9 @@ def _():
     ones = my_area_blend(torch.ones(2, 3, 4), queries)
     assert torch.allclose(ones, torch.ones(2, 3)), f"four values of 1 blend to 1; you have {ones[0].tolist()}"
     wanted = area_blend(values, queries)
-    assert torch.allclose(mine, wanted), f"the library has {wanted[0].tolist()}, you have {mine[0].tolist()}: the order?"
+    assert torch.allclose(mine, wanted), (
+        f"the library has {wanted[0].tolist()}, you have {mine[0].tolist()}: the order?"
+    )
 
 
 # %% tags=["wrong"]
@@ -172,8 +174,8 @@ def my_area_blend(values, queries):
 # %% [markdown]
 # ## 2. Rays to learn from
 #
-# The paper trains on pixels of stored images of 128 × 2048. We have the world itself: `ContinuousRays` draws a street, a
-# place, a crop of 64 columns of the 16-beam image there, and casts rays at *random directions* between its pixels. No
+# The paper trains on pixels of stored images of 128 × 2048. We have the world itself: `ContinuousRays` draws a street,
+# a place, a crop of 64 columns of the 16-beam image there, and casts rays at *random directions* between its pixels. No
 # two batches are alike, and no resolution is built in.
 
 # %%
@@ -185,7 +187,9 @@ print("images ", tuple(batch.image.shape), "queries", tuple(batch.queries.shape)
 figure, axis = plt.subplots(figsize=(9, 2.6), layout="constrained")
 shown = axis.imshow(batch.image[0].cpu(), cmap="viridis_r", vmin=0, vmax=50, origin="lower", aspect="auto")
 rows, columns = batch.queries[0].cpu().T
-axis.scatter(columns, rows, c=batch.ranges[0].cpu(), cmap="viridis_r", vmin=0, vmax=50, s=14, edgecolors="white", lw=0.4)
+axis.scatter(
+    columns, rows, c=batch.ranges[0].cpu(), cmap="viridis_r", vmin=0, vmax=50, s=14, edgecolors="white", lw=0.4
+)
 axis.set(xlabel="column", ylabel="row", title="a crop, and the 384 rays that are asked between its pixels")
 figure.colorbar(shown, label="range [m]")
 plt.show()
@@ -243,10 +247,8 @@ assert curve[STEPS]["mae"] < curve[STEPS // 4]["mae"]
 # %% [markdown]
 # And a blend without any training, on the same scan. `blend` is what you know from notebook 03, with zero scores.
 
+
 # %%
-from kernels import gather_blend  # noqa: E402
-
-
 def blend(image, queries):
     return gather_blend(image, queries, image.new_zeros(*queries.shape[:2], 4), "bilinear")
 
@@ -279,7 +281,8 @@ low, high = r.amin(-1), r.amax(-1)
 flat = (high - low < 0.2) & (true < 80)
 for name, ranges in predicted.items():
     error = (ranges - true)[flat].abs()
-    print(f"{name:>9}, flat places: median error {100 * error.median():6.1f} cm, within 10 cm {(error < 0.1).float().mean():.0%}")
+    within = (error < 0.1).float().mean()
+    print(f"{name:>9}, flat places: median error {100 * error.median():6.1f} cm, within 10 cm {within:.0%}")
 outside = (predicted["liif"] < low) | (predicted["liif"] > high)
 print(f"LIIF is outside of the span of its neighbours at {outside[flat].float().mean():.0%} of them")
 if FAST:
@@ -341,8 +344,8 @@ def share_outside(predicted, r, tolerance):
 # %% [markdown]
 # ## 5. What it does to an edge
 #
-# We take the strongest upright edges of the scan again, as in notebook 03, and let the query walk from one column to the
-# next across each.
+# We take the strongest upright edges of the scan again, as in notebook 03, and let the query walk from one column to
+# the next across each.
 #
 # **Predict:** the MLP is a continuous function of the offset. How will its answer look beside the jump of the truth?
 
@@ -388,8 +391,8 @@ plt.show()
 #
 # Suppose $h$ were *perfect* on its own side: each neighbour says the true range of the surface that it lies on, near
 # $n$ or far $f$, and the left two neighbours lie on the near one. The areas blend these opinions. Write
-# `perfect_liif(near, far, g)`, what LIIF then says for a query with the fraction $g$ (Q,) of the way from the left column to
-# the right one. (In words for yourself: does a perfect $h$ help?)
+# `perfect_liif(near, far, g)`, what LIIF then says for a query with the fraction $g$ (Q,) of the way from the left
+# column to the right one. (In words for yourself: does a perfect $h$ help?)
 #
 # <details><summary>Hint</summary>
 #
@@ -441,8 +444,8 @@ def perfect_liif(near, far, g):
 # ## Summary
 #
 # 1. LIIF predicts a value for each neighbour and blends the values by area.
-# 2. It has to learn even the range of a flat wall to the centimetre, which a blend of measurements gets for nothing. Early in
-#    training it does worse than a formula.
+# 2. It has to learn even the range of a flat wall to the centimetre, which a blend of measurements gets for nothing.
+#    Early in training it does worse than a formula.
 # 3. At an edge it draws a slope, and its values may leave the span of what was measured.
 #
 # ## Next

@@ -26,6 +26,7 @@ from nbformat import NotebookNode
 HERE = Path(__file__).parent
 TIMEOUT = 600  # seconds a cell, where other things run as well
 PICTURE_WIDTH = 640  # pixels
+WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
 def tagged(cell: NotebookNode, tag: str) -> bool:
@@ -96,7 +97,7 @@ def execute(made: NotebookNode, folder: str) -> None:
     made.metadata.pop("widgets", None)
     for cell in made.cells:
         if cell.cell_type == "code":
-            cell.outputs = [o for o in cell.outputs if "application/vnd.jupyter.widget-view+json" not in o.get("data", {})]
+            cell.outputs = [output for output in cell.outputs if WIDGET not in output.get("data", {})]
 
 
 def draw_goal(made: NotebookNode, file: Path) -> None:

@@ -76,6 +76,30 @@ def test_every_exercise_has_a_solution_a_check_and_an_answer_that_is_refused(sou
 
 
 @each_notebook
+def test_its_head_says_what_it_is_about_and_its_picture_is_there(source):
+    notebook = written(source)
+    head = notebook.cells[0].source
+    assert re.match(rf"# {source.stem[:2]} · \S", head)
+    [(words, picture)] = re.findall(r"!\[([^]]+)\]\(([^)]+)\)", head)
+    assert picture == f"pictures/{source.stem}.png"
+    assert len(words) > 60, "the picture in words, for those who cannot see it"
+    assert (FOLDER / picture).read_bytes().startswith(b"\x89PNG")
+    for part in ("**Goal.**", "**After this notebook you can**", "| You know |", "| Time |", "| Hardware |"):
+        assert part in head
+    assert sum(len(group["exercise"]) for group in build.exercises(source)) >= 3
+
+
+def test_notebooks_and_readme_lead_to_notebooks_that_exist():
+    names = {source.stem for source in SOURCES}
+    readme = (FOLDER.parent / "README.md").read_text()
+    for source in SOURCES:
+        text = "".join(cell.source for cell in written(source).cells if cell.cell_type == "markdown")
+        assert set(re.findall(r"\]\((?:\./)?([^):]+)\.ipynb\)", text)) <= names
+        assert f"](notebooks/{source.stem}.ipynb)" in readme
+        assert f"notebooks/pictures/{source.stem}.png" in readme
+
+
+@each_notebook
 def test_it_runs_with_its_solutions_and_refuses_wrong_answers(source, tmp_path):
     for name, message in prove(source, tmp_path):
         assert name == "AssertionError"
