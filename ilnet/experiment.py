@@ -87,9 +87,9 @@ class Study:
         """The networks that are compared with other methods."""
         return {name: self.trained(name, name) if self.preset else name for name in ("liif", "iln", "iln-prior")}
 
-    def compare(self, files: Mapping[str, str | Path], sizes: Sequence[tuple[int, int]] = ()) -> list[dict[str, Any]]:
+    def compare(self, files: Mapping[str, str | Path | models.Model], sizes: Sequence[tuple[int, int]] = ()) -> list[dict[str, Any]]:
         """Measures models, by the names their rows shall bear, on the test towns; at all `SIZES` unless told."""
-        loaded = {label: models.load(file) for label, file in files.items()}
+        loaded = {label: f if isinstance(f, models.Model) else models.load(f) for label, f in files.items()}
         rows = []
         for size in sizes or SIZES:
             output = evaluate.INPUT.resize(*size)
@@ -226,13 +226,19 @@ def _frame_time(model: models.Model) -> float:
 
 
 def prior(study: Study) -> None:
-    """Ours: a geometric prior on the weights, and more weight on small errors (`train.FLATS`)."""
-    usual = models.create("iln-prior").prior
-    files: dict[str, str | Path] = {"none": study.trained("iln-0", "iln")}
-    files["none, small errors"] = study.trained("iln-flats", "iln", flats=train.FLATS["iln-prior"])
-    for kind in ("bilinear", "perspective", "planes"):
-        files[kind] = study.trained(f"iln-{kind}", "iln-prior", prior=kind, flats=0.0)
-    files[f"{usual}, small errors"] = study.trained("iln-prior-0", "iln-prior")
+    """Ours: a geometric prior on the weights, and answers that snap to planes."""
+    files: dict[str, models.Model] = {}
+    usual = models.create("iln-prior")
+    for kind in ("none", "bilinear", "perspective", "planes"):
+        label, name = ("iln-0", "iln") if kind == "none" else (f"iln-{kind}", "iln-prior")
+        if kind == usual.prior:
+            label = "iln-prior-0"
+        options = {} if kind == "none" else {"prior": kind}
+        file = study.trained(label, name, **options)
+        for snap in (0.0, usual.snap):
+            model = models.load(file)
+            model.snap = snap
+            files[kind + (", snapped" if snap else "")] = model
     rows = [{"prior": row.pop("model"), **row} for row in study.compare(files)]
     study.write("prior", rows)
     _bars(study, "prior", rows, "prior", "prior")

@@ -1,4 +1,4 @@
-"""Training with Lightning: L1 on normalised ranges (paper, Sec. III-B), and more weight on small errors if asked for.
+"""Training with Lightning: L1 on normalised ranges (paper, Sec. III-B).
 
 What is learned from are rays cast at continuous directions while training goes on, or, as in the paper, the pixels of
 images stored on disk. Under `torchrun` several processes share each batch.
@@ -36,10 +36,6 @@ TARGET_SIZE = 128, 2048
 HELD_OUT = {"town01": 1, "town03": 1, "town05": 1}
 HELD_OUT_SCANS = 4
 PRECISION: Any = "bf16-mixed"
-# How much steeper than L1 the loss is at small errors, and up to which metres. A network with a prior is right on flat
-# surfaces before it learns anything, and L1 alone gives up centimetres there for a little at far edges.
-FLATS = {"iln-prior": 5.0}
-FLAT_ERROR = 0.1
 # Validations in a training, and the fewest and most steps between them.
 VALIDATIONS = 20
 VALIDATE_EVERY = 50, 2000
@@ -100,7 +96,6 @@ class Training(lightning.LightningModule):
         model: What is trained; it has a `norm_range`.
         held_out: Pairs of an input scan and the scan to be predicted.
         probe: More such pairs, whose figures are logged and decide nothing.
-        flats: Weight of small errors, see `loss`.
         rate: Highest learning rate.
         halve_after: Steps after which the rate is halved; where empty, it follows one cycle.
         run: What tells this run from others; kept in its checkpoints.
@@ -114,10 +109,9 @@ class Training(lightning.LightningModule):
         halve_after: Sequence[int] = (),
         run: dict[str, Any] | None = None,
         probe: Sequence[Pair] = (),
-        flats: float = 0.0,
     ):
         super().__init__()
-        self.model, self.rate, self.halve_after, self.run, self.flats = model, rate, halve_after, run, flats
+        self.model, self.rate, self.halve_after, self.run = model, rate, halve_after, run
         self.pairs = {"val": held_out, "test": probe}
         self.figures = nn.ModuleDict({kind: metrics.ScanMetrics() for kind, pairs in self.pairs.items() if pairs})
         self.begun = time.monotonic()
@@ -130,20 +124,10 @@ class Training(lightning.LightningModule):
         """Counts the time of the run that goes on."""
         self.begun = time.monotonic() - checkpoint["seconds"]
 
-    def loss(self, errors: torch.Tensor) -> torch.Tensor:
-        """The mean of |e| + k c log(1 + |e| / c) with k = `flats` and c = 0.1 m, ranges scaled to [-1, 1].
-
-        Args:
-            errors: Any shape, metres.
-        """
-        errors = errors.abs()
-        if self.flats:
-            errors = errors + self.flats * FLAT_ERROR * (errors / FLAT_ERROR).log1p()
-        return errors.mean() * (2 / self.model.norm_range)  # type: ignore[operator]
-
     def training_step(self, batch: data.Batch, index: int) -> torch.Tensor:
-        """The loss of a batch."""
-        loss = self.loss(self.model(batch.image, batch.queries, wrap=batch.wrap) - batch.ranges)
+        """L1 between ranges scaled to [-1, 1]."""
+        predicted = self.model(batch.image, batch.queries, wrap=batch.wrap)
+        loss = (predicted - batch.ranges).abs().mean() * (2 / self.model.norm_range)
         if not loss.isfinite():
             file = Path(self.trainer.default_root_dir) / f"step-{self.global_step}.pt"
             torch.save({"batch": batch._asdict(), "model": self.model.state_dict()}, file)
@@ -172,7 +156,7 @@ class Training(lightning.LightningModule):
         """Adam; the rate warms up and decays to 0, or is halved now and then."""
         # While the head of a network with a prior is next to zero, so are the gradients of its encoder: Adam would blow
         # up their noise, and the features with it, were its eps not above them.
-        optimizer = torch.optim.Adam(self.parameters(), lr=self.rate, eps=1e-5)
+        optimizer = torch.optim.Adam(self.parameters(), lr=self.rate, eps=1e-6)
         steps = int(self.trainer.estimated_stepping_batches)
         schedule: torch.optim.lr_scheduler.LRScheduler
         if self.halve_after:
@@ -191,7 +175,6 @@ def train(
     archive: Path | None = None,
     target: tuple[int, int] = TARGET_SIZE,
     probe: Sequence[Pair] = (),
-    flats: float | None = None,
     **arguments: Any,
 ) -> dict[str, float]:
     """Trains a model and writes its weights and figures; goes on where an interrupted run in `out` stopped.
@@ -210,7 +193,6 @@ def train(
         target: Size (rows, columns) of the stored images to learn from; the one that LiDAR-SR predicts.
         probe: Pairs of an input scan and the scan to be predicted, whose figures are logged as `test/...` and decide
             nothing.
-        flats: How much steeper than L1 the loss is at small errors, instead of what `FLATS` says for the model.
         **arguments: Override the model's.
 
     Returns:
@@ -239,9 +221,8 @@ def train(
     per_epoch = -(-len(stored) // size.crops) if stored else 0
     steps = steps or size.steps or size.epochs * per_epoch
     arguments = {**size.arguments(name), **arguments}
-    flats = FLATS.get(name, 0.0) if flats is None else flats
     learns_from = f"{_words(target)} of {archive}" if archive else "continuous rays"
-    run = {"preset": preset_name, "steps": steps, "seed": seed, "data": learns_from, "flats": flats, **arguments}
+    run = {"preset": preset_name, "steps": steps, "seed": seed, "data": learns_from, **arguments}
     folder = out / name
     start = _steps_done(folder / "last.ckpt", run)
 
@@ -258,8 +239,7 @@ def train(
             data.street(town, held_out_seed, device), HELD_OUT_SCANS, [preset(INPUT), output]
         )
     ]
-    halve_after = [epoch * per_epoch for epoch in size.halve_after]
-    training = Training(model, held_out, size.rate, halve_after, run, probe, flats)
+    training = Training(model, held_out, size.rate, [epoch * per_epoch for epoch in size.halve_after], run, probe)
     places = [(kind, place) for kind, pairs in training.pairs.items() for place in range(number, len(pairs), processes)]
     scans: DataLoader[tuple[str, int]] = DataLoader(places, batch_size=None)  # type: ignore[arg-type]
     best = ModelCheckpoint(folder, "best", monitor="val/iou", mode="max", enable_version_counter=False)

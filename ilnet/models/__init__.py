@@ -42,7 +42,7 @@ _MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
     "liif": (LIIF, {}),
     "lidar-sr": (LiDARSR, {}),
     "iln": (ILN, {}),
-    "iln-prior": (ILN, {"prior": "planes"}),
+    "iln-prior": (ILN, {"prior": "perspective", "snap": 0.02}),
 }
 NAMES = tuple(_MODELS)
 TRAINABLE = tuple(name for name, (kind, _) in _MODELS.items() if kind not in (Nearest, Bilinear, Planes))

@@ -81,12 +81,14 @@ class ILN(Model):
         blocks: Residual blocks of the encoder.
         heads: Attention heads; they divide `features`.
         dropout: Rate in the attention blocks while training; the authors' is 0.1.
+        snap: The network says which surface is seen, `kernels.plane_prior` where on it: in inference an answer that is
+            off from that of the planes by less than this share of the range is replaced by theirs.
         area_floor: Least bilinear area in the prior, so that a measured pixel can be overruled.
         sharpness: Of the step that "planes" expects at an edge; soft enough to learn where it is.
         norm_range: Metres that the encoder sees as +1; no return is filled with it.
 
     Raises:
-        ValueError: If the prior is unknown or the heads do not divide the features.
+        ValueError: If the prior is unknown, the heads do not divide the features, or `snap` is no share.
 
     Source: paper Sec. II-B, Figs. 2 and 3; sizes as in the authors' code. 1,244,673 parameters at D = 1.
     """
@@ -99,6 +101,7 @@ class ILN(Model):
         blocks: int = 16,
         heads: int = 8,
         dropout: float = 0.0,
+        snap: float = 0.0,
         area_floor: float = 1e-4,
         sharpness: float = 4.0,
         norm_range: float = 100.0,
@@ -107,8 +110,10 @@ class ILN(Model):
             raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}, planes")
         if heads < 1 or features % heads:
             raise ValueError(f"heads is {heads}; it should divide the {features} features")
+        if not 0 <= snap < 1:
+            raise ValueError(f"snap is {snap}; it should be a share of the range, at least 0 and below 1")
         super().__init__()
-        self.prior, self.area_floor, self.sharpness = prior, area_floor, sharpness
+        self.prior, self.snap, self.area_floor, self.sharpness = prior, snap, area_floor, sharpness
         self.norm_range, self.dropout = norm_range, dropout
         self.encoder = Encoder(features, blocks)
         self.position = nn.Linear(2, features)
@@ -131,6 +136,14 @@ class ILN(Model):
 
     def decode(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Weighs and blends the 4 neighbours of each query."""
+        ranges = self._blend(encoded, image, queries, wrap)
+        if self.training or self.snap == 0:
+            return ranges
+        scores = plane_prior(image, queries, wrap, backend=self.backend)
+        planes = gather_blend(image, queries, scores, "none", wrap, backend=self.backend)
+        return planes.where((ranges - planes).abs() < self.snap * planes, ranges)
+
+    def _blend(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         features, projected = encoded
         blocks, prior, planes = self.blocks, self.prior, None
         if prior == "planes":

@@ -92,8 +92,10 @@ def test_ablations_and_measured_scans(study, tmp_path, yard):
         experiment.EXPERIMENTS[name](study)
         assert (study.out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
     assert [row["depth"] for row in rows(study, "attention")[::2]] == ["0", "1", "2", "4"]
-    kinds = {"none", "none, small errors", "bilinear", "perspective", "planes", "planes, small errors"}
-    assert {row["prior"] for row in rows(study, "prior")} == kinds
+    kinds = "none", "bilinear", "perspective", "planes"
+    found = {(row["prior"], row["size"]): row for row in rows(study, "prior")}
+    assert {kind for kind, _ in found} == {*kinds, *(f"{kind}, snapped" for kind in kinds)}
+    assert all(found[kind, "32x512"]["mae"] != found[f"{kind}, snapped", "32x512"]["mae"] for kind in kinds)
     assert {row["beams"] for row in rows(study, "real")} == {"8", "16"}
     assert set(metrics.FIGURES[:5]) < set(rows(study, "real")[0])
 

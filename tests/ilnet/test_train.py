@@ -36,24 +36,6 @@ def test_writes_weights_that_load_and_figures(tmp_path, quick):
         assert any(row["val/iou"] for row in csv.DictReader(log))
 
 
-def test_the_loss_by_hand():
-    errors = torch.tensor([0.0, -0.1, 0.1, 20.0])
-    usual = train.Training(models.create("iln", blocks=1), [], 1e-3)
-    assert usual.loss(errors).item() == pytest.approx(20.2 / 4 * 2 / 100)
-    flat = train.Training(models.create("iln", blocks=1), [], 1e-3, flats=5.0)
-    logarithms = 2 * np.log(2) + np.log(201)
-    assert flat.loss(errors).item() == pytest.approx((20.2 + 5 * 0.1 * logarithms) / 4 * 2 / 100)
-
-
-def test_small_errors_weigh_more_where_a_prior_is_right_about_them(tmp_path, quick, monkeypatch):
-    seen = []
-    step = train.Training.training_step
-    monkeypatch.setattr(train.Training, "training_step", lambda self, *a: seen.append(self.flats) or step(self, *a))
-    quick(tmp_path / "usual", steps=1)
-    quick(tmp_path / "told", steps=1, flats=0.0)
-    assert seen == [train.FLATS["iln-prior"], 0.0]
-
-
 def test_the_same_seed_gives_the_same_weights(tmp_path, quick):
     weights = []
     for number, seed in enumerate((0, 0, 1)):
