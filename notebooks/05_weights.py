@@ -181,6 +181,8 @@ class Network(nn.Module):
         layers = [nn.Linear(features + 2, hidden), nn.ReLU()]
         for _ in range(3):
             layers += [nn.Linear(hidden, hidden), nn.ReLU()]
+        for layer in layers[::2]:  # keeps signals at their size from layer to layer
+            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
         self.h = nn.Sequential(*layers, nn.Linear(hidden, 1))
 
     def forward(self, image, queries, wrap=True):
@@ -202,6 +204,9 @@ for name, network in networks.items():
     print(f"{name:>22}: {sum(p.numel() for p in network.parameters()):,} parameters")
 
 # %% [markdown]
+# (The MLP starts from larger weights than PyTorch's own. From those LIIF gets to an IoU of 0.07 in the training below
+# instead of 0.04, and the MLP that says scores learns next to nothing in so few steps.)
+#
 # The third is the paper's network: instead of the MLP, the four neighbours first look at one another (*attention*,
 # notebook 07). It has fewer parameters.
 #
@@ -332,9 +337,9 @@ left.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# *In words: left, IoU over the step. Both networks that predict weights start at 0.1 or above, untrained, and climb;
-# the one that predicts values stays near zero for half of the training. Right, the MAE: LIIF starts outside of the
-# picture and comes down to about the others' level late.*
+# *In words: left, IoU over the step. Both networks that predict weights start at 0.14, untrained: the mean of the four
+# neighbours. ILN climbs steeply, the MLP slowly; the network that predicts values stays close to zero. Right, the MAE:
+# LIIF starts outside of the picture and comes down to the others' level late.*
 #
 # ## 6. The same edge
 #

@@ -831,27 +831,27 @@ trained, odd, narrow, _, widest, room = conditions
 for found in beyond.values():
     assert abs(found[odd] - found[trained]) < 0.02
 for condition in conditions:
-    order = [beyond[name][condition] for name in ("planes", "iln-prior", "iln", "bilinear", "liif")]
+    ahead = min(beyond[name][condition] for name in ("planes", "iln-prior"))
+    order = [ahead, *(beyond[name][condition] for name in ("iln", "bilinear", "liif"))]
     assert order == sorted(order, reverse=True)
 assert beyond["bilinear"][narrow] - beyond["bilinear"][trained] > 0.04
 assert beyond["liif"][trained] - beyond["liif"][narrow] > 0.03
 lost = {name: found[trained] - found[widest] for name, found in beyond.items()}
-assert lost["iln"] > lost["iln-prior"] > lost["planes"]
+assert lost["iln"] > max(lost["iln-prior"], lost["planes"])
 kept = {name: found[room] / found[trained] for name, found in beyond.items()}
 assert kept["liif"] < min(kept[name] for name in ("iln", "iln-prior", "planes"))
 assert max(kept[name] for name in ("iln", "iln-prior", "planes")) < kept["bilinear"]
 
 # %% [markdown]
 # *In words: two panels with the six conditions side by side, each method a marker. The order is the same in all six:
-# planes, iln-prior, iln, bilinear, liif. From "as trained" to "narrow" the markers of bilinear and planes go up, those
+# planes and iln-prior close together, then iln, bilinear, liif. From "as trained" to "narrow" the markers of bilinear and planes go up, those
 # of the two ILN stay, and that of liif falls. At "very wide" iln comes down most. In the hall all lie closer to
 # bilinear, and liif farther below it.*
 #
 # - **Another output size costs nothing**, as it should.
 # - **A narrow field of view is an easier task**: neighbours are closer together, and the rules gain. LIIF *loses*. It
 #   has learned how far ranges run apart within one pixel of 2°, and predicts that still.
-# - **A very wide one is harder for everybody**, and ILN loses most. Its prior holds `iln-prior` up: where the network
-#   has nothing to say, geometry has.
+# - **A very wide one is harder for everybody**, and ILN loses most. Geometry holds `iln-prior` up: its answers snap to planes.
 # - **The hall is another world**, and the order survives. Everybody's margin over bilinear shrinks, also that of
 #   `planes`, which has learned nothing: to a part the hall is just a good place for bilinear. Of what it had, LIIF
 #   loses most.

@@ -489,7 +489,8 @@ for name, f in judged.items():
 if FILE is None:
     assert judged["planes"]["iou"] > judged["iln-prior"]["iou"] > judged["iln"]["iou"] > judged["liif"]["iou"]
     assert judged["liif"]["iou"] < 0.5 * judged["bilinear"]["iou"]
-    assert judged["iln-prior"]["iou"] < judged["bilinear-inverse"]["iou"]
+    assert judged["iln"]["iou"] < judged["bilinear-inverse"]["iou"]
+    assert judged["iln-prior"]["iou"] < 1.1 * judged["bilinear-inverse"]["iou"]
     assert judged["iln-prior"]["floating"] < 0.4 * judged["bilinear-inverse"]["floating"]
     assert min(f["mae"] for f in judged.values()) > 20 * judged["iln-prior"]["median"]
 
@@ -499,9 +500,10 @@ if FILE is None:
 # here its median.
 #
 # `liif` suffers most. It was trained on rays without noise and holes, and each of the values that it makes up depends
-# on all pixels around. What blends measured ranges keeps the good ones. But the networks have lost their lead: in IoU
-# `iln-prior` is no better here than `bilinear-inverse`, which learned nothing. What is left of it are the edges: a
-# third of the floating points. `planes` is ahead of all. Section 6 looks at holes and at wide gaps one by one.
+# on all pixels around. What blends measured ranges keeps the good ones. But the networks have lost most of their lead:
+# in IoU `iln` falls behind `bilinear-inverse`, which learned nothing, and `iln-prior`, which snaps to planes, is hardly
+# ahead of it. What is left are the edges: a third of the floating points. `planes` is ahead of all. Section 6 looks at
+# holes and at wide gaps one by one.
 
 # %% tags=["goal"]
 clouds = {
@@ -667,13 +669,13 @@ assert rough["iln-prior"][2] < 0.5 * rough["iln"][2]
 
 # %% [markdown]
 # *In words: left, roughness by spacing on a logarithmic scale; all curves rise. bilinear-inverse stays at a fraction of
-# a centimetre, iln-prior near it. planes does as well up to 4 degrees, and jumps to ten centimetres at 6. liif and iln
-# rise to several centimetres, bilinear is the worst throughout. Right, height by distance with 4 degrees between beams:
-# bilinear sags between beams like a rope, by up to 12 cm; iln wavers by two, iln-prior by half a centimetre.*
+# a centimetre, and iln-prior on it up to 4 degrees. planes does as well up to there, and jumps to ten centimetres at 6.
+# liif and iln rise to several centimetres, bilinear is the worst throughout. Right, height by distance with 4 degrees
+# between beams: bilinear sags between beams like a rope, by up to 12 cm; iln wavers by two; iln-prior is straight.*
 #
-# Inverse ranges do not care about the spacing. Learned habits do, and a prior holds them. The rule of `planes` breaks
-# in its own way: 6° apart, the last two beams that meet the road do so at 11 m and at 34 m, and it takes the stretch
-# between them for an edge.
+# Inverse ranges do not care about the spacing. Learned habits do; `iln-prior` snaps to planes where it comes close to
+# them. The rule of `planes` breaks in its own way: 6° apart, the last two beams that meet the road do so at 11 m and at
+# 34 m, and it takes the stretch between them for an edge.
 
 # %% [markdown]
 # ### A mirrored world, and other units
