@@ -391,9 +391,9 @@ def draw_walk(number=0):
 draw_walk()
 
 # %% [markdown]
-# *In words: left, the answers between two columns: LIIF's curve misses both measured levels, ILN's starts on one level,
-# ends on the other, and is steeper than a straight line in between. Right, its weights as stacked bands: those of the
-# left neighbours shrink and those of the right ones grow.*
+# *In words: left, the answers between two columns, one measured at 6 m and one at 16 m. LIIF and the MLP draw almost
+# straight slopes; ILN's curve comes closer to both levels and is steeper between them. Right, its weights as stacked
+# bands: those of the left neighbours shrink on the way and those of the right ones grow.*
 #
 # Other edges (in a running notebook):
 
