@@ -109,9 +109,9 @@ def _tall(cells: Cells) -> float:
 
 def _draw_cells(axes: Axes, cells: Cells, colour: str, x: float, top: float, side: int) -> list[tuple[float, float]]:
     """One array as a grid below its name; returns where the touched rows meet their arrows."""
-    width = CELL * cells.shape[1]
-    place = {"x": x + width, "ha": "right"} if side < 0 else {"x": x, "ha": "left"}
-    axes.text(y=top - 0.12, s=cells.name, fontsize=9, family="monospace", va="center", **place)
+    right, aligned = x + CELL * cells.shape[1], "right" if side < 0 else "left"
+    name_x = right if side < 0 else x
+    axes.text(name_x, top - 0.12, cells.name, fontsize=9, family="monospace", va="center", ha=aligned)
     ends: dict[int, tuple[float, float]] = {}
     for row in range(cells.shape[0]):
         for column in range(cells.shape[1]):

@@ -87,7 +87,9 @@ class Study:
         """The networks that are compared with other methods."""
         return {name: self.trained(name, name) if self.preset else name for name in ("liif", "iln", "iln-prior")}
 
-    def compare(self, files: Mapping[str, str | Path | models.Model], sizes: Sequence[tuple[int, int]] = ()) -> list[dict[str, Any]]:
+    def compare(
+        self, files: Mapping[str, str | Path | models.Model], sizes: Sequence[tuple[int, int]] = ()
+    ) -> list[dict[str, Any]]:
         """Measures models, by the names their rows shall bear, on the test towns; at all `SIZES` unless told."""
         loaded = {label: f if isinstance(f, models.Model) else models.load(f) for label, f in files.items()}
         rows = []
@@ -229,6 +231,7 @@ def prior(study: Study) -> None:
     """Ours: a geometric prior on the weights, and answers that snap to planes."""
     files: dict[str, models.Model] = {}
     usual = models.create("iln-prior")
+    assert isinstance(usual, models.ILN)
     for kind in ("none", "bilinear", "perspective", "planes"):
         label, name = ("iln-0", "iln") if kind == "none" else (f"iln-{kind}", "iln-prior")
         if kind == usual.prior:
@@ -237,6 +240,7 @@ def prior(study: Study) -> None:
         file = study.trained(label, name, **options)
         for snap in (0.0, usual.snap):
             model = models.load(file)
+            assert isinstance(model, models.ILN)
             model.snap = snap
             files[kind + (", snapped" if snap else "")] = model
     rows = [{"prior": row.pop("model"), **row} for row in study.compare(files)]
