@@ -142,8 +142,9 @@ for number, (name, scan) in enumerate((("bilinear", bilinear), ("network", netwo
 show_scene(plotter)
 
 # %% [markdown]
-# *In words: three point clouds of the same street. In the bilinear one veils of points hang between the cars and the
-# walls behind them. In the network's most of them are gone. In the truth there are none.*
+# *In words: three point clouds of the same street: left bilinear, middle the network, right the truth. In the bilinear
+# one veils of points hang between the cars and the walls behind them. In the network's most of them are gone. In the
+# truth there are none.*
 #
 # ## 4. In numbers
 #
