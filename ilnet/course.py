@@ -44,7 +44,7 @@ def show_scene(plotter: Any) -> HTML | Image:
         plotter.close()
         # Without a width of its own it shrinks with the page.
         style = f"width: 100%; max-width: {width}px; height: {height}px; border: 0"
-        return HTML(f'<iframe srcdoc="{page}" style="{style}"></iframe>')
+        return HTML(f'<div><iframe srcdoc="{page}" style="{style}"></iframe></div>')
     pixels = plotter.screenshot()
     plotter.close()
     png = io.BytesIO()
