@@ -40,7 +40,7 @@ def show_scene(plotter: Any) -> HTML | Image:
     """
     if "JPY_SESSION_NAME" in os.environ or "VSCODE_PID" in os.environ:  # somebody sits there
         width, height = plotter.window_size
-        page = escape(plotter.export_html(None).getvalue())
+        page = escape(plotter.trame.export_html(None).getvalue())
         plotter.close()
         # Without a width of its own it shrinks with the page.
         style = f"width: 100%; max-width: {width}px; height: {height}px; border: 0"
