@@ -401,8 +401,8 @@ draw_walk()
 _ = interact(draw_walk, number=(0, len(edges) - 1, 1))
 
 # %% [markdown]
-# After so short a training the step is still soft. With `FAST = False` it gets steeper. It can: nothing in a softmax of
-# scores is bounded by areas.
+# After so short a training the step is still soft. See what `FAST = False` makes of it. It can be sharp: nothing in a
+# softmax of scores is bounded by areas.
 #
 # ## 7. Start from a formula
 #
