@@ -300,7 +300,7 @@ def _words(size: tuple[int, int]) -> str:
 
 def _workers(device: torch.device) -> dict[str, Any]:
     """Who makes batches: a process beside the training, where there are cores to spare for it."""
-    # On two cores it takes more than it gives: a batch is drawn in an eighth of the time of a step.
+    # On two cores it takes more than it gives: a batch is drawn in a sixth of the time of a step.
     spare = device.type == "cpu" and torch.get_num_threads() > 2 and "fork" in multiprocessing.get_all_start_methods()
     return {"num_workers": 1, "multiprocessing_context": "fork"} if spare else {}
 
