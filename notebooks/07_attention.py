@@ -358,7 +358,7 @@ def attend_by_kernel(qkv):
 # %%
 draw_thread(
     "_attend_kernel: thread (n, h) lets the four neighbours of query n attend to each other in head h",
-    reads=[Cells("qkv[n]: 12 rows, heads side by side", (12, 12), [(i, j) for i in range(12) for j in (3, 4, 5)])],
+    reads=[Cells("qkv[n], heads side by side", (12, 12), [(i, j) for i in range(12) for j in (3, 4, 5)])],
     steps="P = softmax(q kᵀ / √D)\n4 x 4, in registers\nmean of v by P",
     writes=[Cells("attended_out[n]", (4, 12), [(i, j) for i in range(4) for j in (3, 4, 5)])],
 )
