@@ -14,16 +14,27 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 
 __all__ = ["Cells", "check", "draw_thread", "show_scene"]
 
+# Inches: of a drawing, and of an element of an array in it.
+_WIDTH, _CELL = 9.0, 0.17
+
 
 def check(checks: Callable[[], object]) -> None:
     """Runs the checks of an exercise at once; a decorator for the function that holds them.
 
-    An answer that is still to be written raises NotImplementedError: that is said, and the notebook goes on. What a
-    wrong answer raises is raised.
+    An answer that is still to be written raises a bare NotImplementedError: that is said, and the notebook goes on.
+    What a wrong answer raises is raised, also a NotImplementedError that says what it is about, such as PyTorch's.
+
+    Args:
+        checks: Asserts what an answer has to fulfil; it takes nothing, and what it returns is ignored.
+
+    Raises:
+        AssertionError: What `checks` finds wrong; and whatever else an answer raises.
     """
     try:
         checks()
-    except NotImplementedError:
+    except NotImplementedError as error:
+        if error.args:
+            raise
         print("Not answered yet: replace the line that raises NotImplementedError, and run both cells again.")
     else:
         print("Right.")
@@ -76,20 +87,20 @@ def draw_thread(title: str, reads: Sequence[Cells], steps: str, writes: Sequence
         A picture, for a cell to end with.
     """
     height = 0.3 + max(sum(_tall(cells) for cells in arrays) for arrays in (reads, writes))
-    figure = Figure(figsize=(WIDTH, height))
+    figure = Figure(figsize=(_WIDTH, height))
     axes = figure.add_axes((0, 0, 1, 1))
-    axes.set(xlim=(0, WIDTH), ylim=(0, height), aspect="equal")
+    axes.set(xlim=(0, _WIDTH), ylim=(0, height), aspect="equal")
     axes.axis("off")
     axes.text(0.1, height - 0.1, title, fontsize=10, va="top")
     middle, half = (height - 0.3) / 2, 1.15
-    box = FancyBboxPatch((WIDTH / 2 - half, middle - 0.45), 2 * half, 0.9, "round,pad=0.05", fc="#fff3d6", ec="black")
+    box = FancyBboxPatch((_WIDTH / 2 - half, middle - 0.45), 2 * half, 0.9, "round,pad=0.05", fc="#fff3d6", ec="black")
     axes.add_patch(box)
-    axes.text(WIDTH / 2, middle, steps, ha="center", va="center", fontsize=9)
+    axes.text(_WIDTH / 2, middle, steps, ha="center", va="center", fontsize=9)
     for arrays, colour, side in ((reads, "#0072b2", -1), (writes, "#d55e00", 1)):
-        thread = WIDTH / 2 + side * (half + 0.07), middle
+        thread = _WIDTH / 2 + side * (half + 0.07), middle
         top = middle + sum(_tall(cells) for cells in arrays) / 2
         for cells in arrays:
-            x = 2.6 - CELL * cells.shape[1] if side < 0 else WIDTH - 2.4
+            x = 2.6 - _CELL * cells.shape[1] if side < 0 else _WIDTH - 2.4
             for end in _draw_cells(axes, cells, colour, x, top, side):
                 ends = (end, thread) if side < 0 else (thread, end)
                 axes.add_patch(FancyArrowPatch(*ends, arrowstyle="-|>", mutation_scale=7, color=colour, alpha=0.6))
@@ -99,25 +110,21 @@ def draw_thread(title: str, reads: Sequence[Cells], steps: str, writes: Sequence
     return Image(png.getvalue())
 
 
-# Inches: of the page, and of an element of an array.
-WIDTH, CELL = 9.0, 0.17
-
-
 def _tall(cells: Cells) -> float:
-    return CELL * cells.shape[0] + 0.45
+    return _CELL * cells.shape[0] + 0.45
 
 
 def _draw_cells(axes: Axes, cells: Cells, colour: str, x: float, top: float, side: int) -> list[tuple[float, float]]:
     """One array as a grid below its name; returns where the touched rows meet their arrows."""
-    right, aligned = x + CELL * cells.shape[1], "right" if side < 0 else "left"
+    right, aligned = x + _CELL * cells.shape[1], "right" if side < 0 else "left"
     name_x = right if side < 0 else x
     axes.text(name_x, top - 0.12, cells.name, fontsize=9, family="monospace", va="center", ha=aligned)
     ends: dict[int, tuple[float, float]] = {}
     for row in range(cells.shape[0]):
         for column in range(cells.shape[1]):
-            corner = x + CELL * column, top - 0.25 - CELL * (row + 1)
+            corner = x + _CELL * column, top - 0.25 - _CELL * (row + 1)
             here = (row, column) in cells.touched
-            axes.add_patch(Rectangle(corner, CELL, CELL, fc=colour if here else "white", ec="#777777", linewidth=0.6))
+            axes.add_patch(Rectangle(corner, _CELL, _CELL, fc=colour if here else "white", ec="#777777", linewidth=0.6))
             if here and (side < 0 or row not in ends):  # the outermost of its row
-                ends[row] = corner[0] + (CELL if side < 0 else 0), corner[1] + CELL / 2
+                ends[row] = corner[0] + (_CELL if side < 0 else 0), corner[1] + _CELL / 2
     return list(ends.values())

@@ -104,7 +104,9 @@ class Study:
         self.out.mkdir(parents=True, exist_ok=True)
         shipped = self.preset is None and name in ("table", "real")
         trained = f"networks trained with preset {self.preset or 'small'}"
-        networks = "the networks that ship (LiDAR-SR: preset small)" if shipped else trained
+        networks = "the networks that ship" if shipped else trained
+        if shipped and any(row["model"] == "lidar-sr" for row in rows):
+            networks += ", LiDAR-SR trained with preset small"
         about = _about(self.out) | {name: {"networks": networks}}
         (self.out / "about.json").write_text(json.dumps(about, indent=1) + "\n")
         with open(self.out / f"{name}.csv", "w", newline="") as file:

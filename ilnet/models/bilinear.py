@@ -5,7 +5,7 @@ import torch
 from ilnet.models.base import Model
 from kernels import gather_blend, plane_prior
 
-__all__ = ["Bilinear", "Nearest", "Planes"]
+__all__ = ["Bilinear", "Nearest", "Planes", "interpolate_planes"]
 
 
 class Nearest(Model):
@@ -35,10 +35,16 @@ class Bilinear(Model):
         return gather_blend(image, queries, scores, self.prior, wrap, backend=self.backend)
 
 
+def interpolate_planes(image: torch.Tensor, queries: torch.Tensor, wrap: bool, backend: str) -> torch.Tensor:
+    """Ranges (B, Q) [m] of queries (B, Q, 2) in images (B, H, W) [m], as planes suggest; see `kernels.plane_prior`."""
+    return gather_blend(
+        image, queries, plane_prior(image, queries, wrap, backend=backend), "none", wrap, backend=backend
+    )
+
+
 class Planes(Model):
     """What planes, the creases between them and the edges before them suggest; see `kernels.plane_prior`."""
 
     def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Answers queries (B, Q, 2) with ranges (B, Q) [m]."""
-        scores = plane_prior(image, queries, wrap, backend=self.backend)
-        return gather_blend(image, queries, scores, wrap=wrap, backend=self.backend)
+        return interpolate_planes(image, queries, wrap, self.backend)

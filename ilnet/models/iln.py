@@ -6,6 +6,7 @@ import torch
 from torch import nn
 
 from ilnet.models.base import OFFSET_SCALE, Model, normalised
+from ilnet.models.bilinear import interpolate_planes
 from ilnet.models.encoder import Encoder
 from kernels import (
     DecoderWeights,
@@ -139,8 +140,7 @@ class ILN(Model):
         ranges = self._blend(encoded, image, queries, wrap)
         if self.training or self.snap == 0:
             return ranges
-        scores = plane_prior(image, queries, wrap, backend=self.backend)
-        planes = gather_blend(image, queries, scores, "none", wrap, backend=self.backend)
+        planes = interpolate_planes(image, queries, wrap, self.backend)
         return planes.where((ranges - planes).abs() < self.snap * planes, ranges)
 
     def _blend(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:

@@ -27,6 +27,12 @@ def test_a_check_says_right_or_not_yet_and_raises_what_is_wrong(capsys):
         def _():
             raise AssertionError("too short")
 
+    with pytest.raises(NotImplementedError, match="aten"):  # an answer, and a wrong one
+
+        @check
+        def _():
+            raise NotImplementedError("Could not run 'aten::bmm'")
+
 
 @pytest.fixture
 def plotter():
