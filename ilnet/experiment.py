@@ -79,9 +79,12 @@ class Study:
         folder = self.out / "weights" / label
         file = folder / f"{name}.safetensors"
         if not file.exists():
-            probe = () if name == "lidar-sr" else self.probe  # which predicts one size only
-            train.train(name, self.preset or "small", folder, probe=probe, **options)
+            train.train(name, self.preset or "small", folder, **options)
         return file
+
+    def followed(self, name: str, seed: int = 0) -> Path:
+        """The same for a network as its preset has it, with test figures in the course of its training."""
+        return self.trained(f"{name}-{seed}", name, seed=seed, probe=self.probe)
 
     def networks(self) -> dict[str, str | Path]:
         """The networks that are compared with other methods."""
@@ -155,7 +158,7 @@ def convergence(study: Study) -> None:
     rows: list[dict[str, Any]] = []
     for name in ("liif", "iln"):
         for seed in range(study.seeds):
-            folder = study.trained(f"{name}-{seed}", name, seed=seed).parent
+            folder = study.followed(name, seed).parent
             rows += [{"model": name, "seed": seed, **row} for row in _probed(folder / name)]
     study.write("convergence", rows)
     figure = Figure(figsize=(10, 3.2), layout="constrained")
@@ -173,7 +176,11 @@ def convergence(study: Study) -> None:
 
 
 def _probed(folder: Path) -> list[dict[str, Any]]:
-    """The test figures that a training logged, each step once, though it was interrupted."""
+    """The test figures that a training logged, each step once, though it was interrupted.
+
+    Its `seconds` are those of its median pace, validations included, so that halts and other work of the machine do
+    not count.
+    """
     found: dict[int, dict[str, Any]] = {}
     for log in folder.glob("from-step-*/metrics.csv"):
         with open(log, newline="") as file:
@@ -182,7 +189,10 @@ def _probed(folder: Path) -> list[dict[str, Any]]:
                     step = int(row["step"]) + 1
                     figures = {key: float(row[f"test/{key}"]) for key in ("mae", "iou", "floating")}
                     found.setdefault(step, {"step": step, "seconds": float(row["seconds"]), **figures})
-    return [found[step] for step in sorted(found)]
+    steps = sorted(found)
+    passed = np.diff([0.0] + [found[step]["seconds"] for step in steps])
+    pace = float(np.median(passed / np.diff([0, *steps])))
+    return [found[step] | {"seconds": step * pace} for step in steps]
 
 
 def steps_to_reach(rows: Sequence[dict[str, Any]], share: float = 0.1) -> dict[str, float]:
@@ -208,7 +218,7 @@ def attention(study: Study) -> None:
     """The paper's ablation of the number D of attention blocks."""
     rows = []
     for depth in (0, 1, 2, 4):
-        file = study.trained("iln-0" if depth == 1 else f"iln-d{depth}", "iln", depth=depth)
+        file = study.followed("iln") if depth == 1 else study.trained(f"iln-d{depth}", "iln", depth=depth)
         model = models.load(file)
         seconds = _frame_time(model)
         parameters = sum(weight.numel() for weight in model.parameters())
@@ -235,11 +245,12 @@ def prior(study: Study) -> None:
     usual = models.create("iln-prior")
     assert isinstance(usual, models.ILN)
     for kind in ("none", "bilinear", "perspective", "planes"):
-        label, name = ("iln-0", "iln") if kind == "none" else (f"iln-{kind}", "iln-prior")
-        if kind == usual.prior:
-            label = "iln-prior-0"
-        options = {} if kind == "none" else {"prior": kind}
-        file = study.trained(label, name, **options)
+        if kind == "none":
+            file = study.followed("iln")
+        elif kind == usual.prior:
+            file = study.followed("iln-prior")
+        else:
+            file = study.trained(f"iln-{kind}", "iln-prior", prior=kind)
         for snap in (0.0, usual.snap):
             model = models.load(file)
             assert isinstance(model, models.ILN)
@@ -260,7 +271,7 @@ def rays(study: Study) -> None:
     rows = []
     for learns_from, archive in (("continuous", None), ("stored", study.archive)):
         for name in ("iln", "iln-prior"):
-            file = study.trained(f"{name}-{0 if archive is None else 'stored'}", name, archive=archive)
+            file = study.trained(f"{name}-stored", name, archive=archive) if archive else study.followed(name)
             rows += [{"rays": learns_from, **row} for row in study.compare({name: file})]
     study.write("rays", rows)
     _bars(study, "rays", [row for row in rows if row["model"] == "iln"], "rays", "learned from (iln)")

@@ -13,8 +13,7 @@
 # %% [markdown]
 # # 00 · The result first
 #
-# ![Four range images of the same street, one above the other: 16 coarse rows; bilinear interpolation, in which cars and
-# trunks have smeared edges; the network, in which edges are sharp; and the true
+# ![Four range images of the same street, one above the other: 16 coarse rows, two dense predictions, and the true
 # scan.](pictures/00_the_result_first.png)
 #
 # **Goal.** You make a LiDAR scan of 16 beams eight times as dense, in a minute and before you know how, and see what is
@@ -22,21 +21,21 @@
 #
 # **After this notebook you can**
 #
-# - upsample a scan to any size with a shipped network, in three lines;
-# - say where bilinear interpolation smears, and what a flying point is;
+# - upsample a scan to any size with a shipped network, in two lines;
+# - say what is wrong with the obvious way, and measure it;
 # - find your way through the course.
 #
 # | | |
 # |---|---|
 # | You know | Python, a little PyTorch (tensors, shapes, indexing) |
-# | Time | 20 minutes to work through; under a minute to run |
+# | Time | 30 minutes to work through; under a minute to run |
 # | Hardware | any computer; a CUDA GPU is used if there is one |
 #
 # How to use the course: read, run each cell (Shift + Enter), and when a line says **Predict:**, write down what you
 # expect before you run the next cell. Exercises check themselves. Their solutions are folded below them.
 
 # %%
-import time
+import math
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -54,29 +53,35 @@ device = "cuda" if torch.cuda.is_available() else "cpu"
 # ## 1. A scan, and what a better sensor would have seen
 #
 # A LiDAR on the roof of a car sends out laser beams and measures how far each gets: its *range*. This one has 16 beams
-# above each other and turns, so that a scan is an image of 16 rows and 1024 columns. We simulate it, in a town that no
-# network has seen in training, and a second, expensive sensor with 128 × 2048 rays at the same place: the truth.
+# one above the other and turns, so that a scan is an image of 16 rows and 1024 columns: rows differ in *elevation*, the
+# angle above the horizon, columns in *azimuth*, the direction on a map. A ray that meets nothing within 80 m has range
+# 0: *no return*. We simulate this sensor, in a town that no network has seen in training, and a second, expensive one
+# with 128 × 2048 rays at the same place: the truth.
 
 # %%
 street = data.street("town10", device=device)
-pose = street.pose(1400)
-world = street.world(pose[:3, 3], seed=1400)
+pose = street.pose(1400)  # (4, 4): where on the street the sensor is, and where it looks
+world = street.world(pose[:3, 3], seed=1400)  # what stands around there, with cars and people of that seed
 
 sparse = simulate.simulate(world, preset("paper-16x1024"), pose)
 truth = simulate.simulate(world, preset("paper-128x2048"), pose)
 print("measured:", tuple(sparse.ranges.shape), " wanted:", tuple(truth.ranges.shape))
 
 # %% [markdown]
-# ## 2. Three lines
+# ## 2. Two lines
 #
-# **Predict:** 15 of 16 wanted rays were not measured. What will the obvious method, interpolating between the four
-# measured pixels around each wanted ray, do to the outline of a car?
+# For every measured ray 16 are wanted, and hardly any of those was measured itself. The obvious method, `bilinear`,
+# interpolates between the four measured pixels around each wanted ray. The network `iln-prior` is that of the paper
+# behind this course, *Implicit LiDAR Network* (Kwon, Sung, Yoon, ICRA 2022), with additions of our own that notebooks
+# 05 and 08 explain.
+#
+# **Predict:** what will the obvious method do to the outline of a car?
 
 # %%
+model = models.load("iln-prior")
+network = model.upsample(sparse, truth.sensor)
+
 bilinear = models.load("bilinear").upsample(sparse, truth.sensor)
-start = time.perf_counter()
-network = models.load("iln-prior").upsample(sparse, truth.sensor)
-print(f"{network.ranges.numel():,} ranges in {time.perf_counter() - start:.1f} s")
 
 # %% tags=["goal"]
 scans = {"measured, 16 beams": sparse, "bilinear": bilinear, "network (iln-prior)": network, "truth, 128 beams": truth}
@@ -95,13 +100,13 @@ plt.show()
 # %% [markdown]
 # *In words: four range images, 120 degrees of each; near is yellow-green, far is dark blue, no return white. The
 # measured one is made of 16 broad stripes. In the bilinear one, things have blurred outlines, green where yellow meets
-# blue. In the network's, outlines are sharp though a little ragged. The truth has thin trunks, poles and cars with
-# windows.*
+# blue. In the network's, outlines are sharp though a little ragged. The truth has thin poles, leaves and the outlines
+# that cars really have.*
 #
 # ## 3. Where it smears
 #
-# Colours hide what a blurred outline means in metres. We walk along one row of the dense images and look at the ranges
-# themselves.
+# Colours hide what a blurred outline means in metres. We walk along one row of the dense images, just below the
+# horizon, and look at the ranges themselves.
 
 # %%
 ROW = 62
@@ -123,34 +128,38 @@ plt.show()
 # %% [markdown]
 # *In words: range over azimuth. The truth (black) runs along a wall at 30 m, then a car before it at 23 m, then a trunk
 # at 13 m. Along the car the bilinear line (grey triangles) keeps three metres behind it, in the air between car and
-# wall. The network's dots lie on the car, though they jump to it a little too late.*
+# wall, and nine metres behind what is right of the trunk. The network's dots lie on both, though they jump to the car a
+# little too late.*
 #
 # A range half way between a car and the wall behind it is a point in empty air: a *flying point*. A robot brakes for
-# it. Seen as points, from above and behind (in a running notebook: turn it with the mouse):
+# it. Here are the points from above and behind, those that fly in orange-red (in a running notebook: turn it with the
+# mouse). Between the leaves of a hedge even true points count as flying now and then.
 
 # %%
 plotter = pyvista.Plotter(off_screen=True, shape=(1, 3), window_size=(1080, 420), border=False)
 for number, (name, scan) in enumerate((("bilinear", bilinear), ("network", network), ("truth", truth))):
     plotter.subplot(0, number)
     plotter.add_text(name, font_size=10, color="black", position="upper_edge")
-    near = scan.points().cpu()
-    near = near[near.norm(dim=1) < 22]
-    cloud = pyvista.PolyData(near.numpy())
-    cloud["height [m]"] = near[:, 2].numpy()
-    plotter.add_mesh(cloud, scalars="height [m]", cmap="viridis", clim=(-2, 4), point_size=2, show_scalar_bar=False)
+    flies = metrics.floating(scan.ranges, truth)[scan.ranges > 0].cpu()
+    points = scan.points().cpu()
+    near = points.norm(dim=1) < 22
+    for part, colour, size in ((near & ~flies, "#9ab6c8", 2), (near & flies, "#d55e00", 3)):
+        if part.any():
+            plotter.add_mesh(pyvista.PolyData(points[part].numpy()), color=colour, point_size=size)
     plotter.camera_position = [(-24, -14, 16), (3, 0, -1), (0, 0, 1)]
 show_scene(plotter)
 
 # %% [markdown]
 # *In words: three point clouds of the same street: left bilinear, middle the network, right the truth. In the bilinear
-# one veils of points hang between the cars and the walls behind them. In the network's most of them are gone. In the
-# truth there are none.*
+# one, veils of flying points spread from the car, the posts and the trees to what is behind them, row by row. The
+# network leaves fewer than half as many, scattered. In the truth there are next to none.*
 #
 # ## 4. In numbers
 #
-# Three figures tell it. **MAE** is the mean error of a range. **IoU** asks which cubes of 10 cm hold a point in both
-# clouds, as a share of those that do in either: 1 is perfect. **Floating** is the share of points in empty space
-# between two surfaces.
+# Three figures tell it. **MAE** is the mean absolute error over all pixels, where no return counts as 100 m: a pixel
+# that has a return and should not, or the other way round, costs tens of metres. **IoU** is the number of 10 cm cubes
+# that hold points of both clouds, divided by the number of those that hold points of either: 1 is perfect. **Floating**
+# is the share of points in empty space between two surfaces. (`upsample` returns a `Scan`, `ranges` only its tensor.)
 
 # %%
 found = {}
@@ -160,30 +169,29 @@ for name in ("bilinear", "iln-prior"):
     found[name] = {key: value.item() for key, value in judge.compute().items()}
     mae, iou, floating = (found[name][key] for key in ("mae", "iou", "floating"))
     print(f"{name:>9}: MAE {mae:.2f} m, IoU {iou:.3f}, floating {floating:.1%}")
+
+# The next cell relies on these.
 assert found["iln-prior"]["mae"] < found["bilinear"]["mae"]
 assert found["iln-prior"]["iou"] > 1.1 * found["bilinear"]["iou"]
 assert found["iln-prior"]["floating"] < 0.6 * found["bilinear"]["floating"]
 
 # %% [markdown]
-# The network wins in all three. It did not invent anything: each of its ranges is a *blend* of the four measured
-# neighbours, like bilinear interpolation. What it learned is **how much to trust each of them.** That is the idea of
-# the paper that this course is about: a network that predicts *weights*, where others predict *values*.
+# The network wins in all three. And yet, like bilinear interpolation, it only *blends* the four measured neighbours: it
+# never leaves their span, though it can still put a point between two of them. What it learned is **how much to trust
+# each of them.** That is the idea of the paper: a network that predicts *weights*, where others predict *values*.
 #
 # ### Exercise 1 · A size of your own
 #
 # ★☆☆ · 5 minutes
 #
 # The network was not trained for 128 × 2048 in particular. Write `upsample_to(scan, rows, columns)`, which returns a
-# `Scan` of that size with the model `network_model` below. Any sensor has a method `resize(rows, columns)`: the same
-# field of view with other numbers of beams and columns.
+# `Scan` of that size with the `model` of section 2. Any sensor has a method `resize(rows, columns)`: the same field of
+# view with other numbers of beams and columns.
 #
 # <details><summary>Hint</summary>
 #
-# `scan.sensor.resize(...)` is the sensor to predict; `network_model.upsample(scan, sensor)` predicts it.
+# In section 2 the sensor to predict was `truth.sensor`. Here it is the scan's own, resized.
 # </details>
-
-# %%
-network_model = models.load("iln-prior")
 
 
 # %% tags=["exercise"]
@@ -193,7 +201,7 @@ def upsample_to(scan, rows, columns):
 
 # %% tags=["solution"]
 def upsample_to(scan, rows, columns):
-    return network_model.upsample(scan, scan.sensor.resize(rows, columns))
+    return model.upsample(scan, scan.sensor.resize(rows, columns))
 
 
 # %% tags=["check"]
@@ -212,32 +220,32 @@ def _():
 
 # %% tags=["wrong"]
 def upsample_to(scan, rows, columns):
-    return network_model.upsample(scan, preset("paper-128x2048"))
+    return model.upsample(scan, preset("paper-128x2048"))
 
 
 # %% tags=["wrong"]
 def upsample_to(scan, rows, columns):
-    return network_model.upsample(scan, scan.sensor.resize(columns, rows))
+    return model.upsample(scan, scan.sensor.resize(columns, rows))
 
 
 # %% tags=["wrong"]
 def upsample_to(scan, rows, columns):
-    return network_model.upsample(scan, scan.sensor.resize(rows, columns)).ranges
+    return model.upsample(scan, scan.sensor.resize(rows, columns)).ranges
 
 
 # %% [markdown]
 # ### Exercise 2 · Good points
 #
-# ★☆☆ · 10 minutes
+# ★☆☆ · 5 minutes
 #
 # Write `share_within(predicted, true, metres)`: of the pixels at which the truth has a return (range above 0), the
-# share whose predicted range is off by at most so many metres, a number from 0 to 1. Where the truth has no return at
-# all, the share is `nan`.
+# share whose predicted range is off by at most so many metres: a Python float from 0 to 1. Where the truth has no
+# return at all, the share is `nan`.
 #
 # <details><summary>Hint</summary>
 #
-# `seen = true > 0` picks the pixels. The mean of `True` and `False` as numbers is a share; the mean of nothing is
-# `nan`.
+# `seen = true > 0` picks the pixels. The mean of `True` and `False` as numbers, `.float().mean().item()`, is a share;
+# the mean of nothing is `nan`.
 # </details>
 
 
@@ -261,7 +269,7 @@ def _():
     assert abs(share - 0.5) > 1e-6, "half of all four pixels are close, but one of the four has no return in the truth"
     assert abs(share - 2 / 3) < 1e-6, f"two of the three pixels with a return are within 0.5 m; you have {share:.3f}"
     assert abs(share_within(predicted, true, 1.0) - 1) < 1e-6, "an error of exactly 1 m is within 1 m"
-    assert np.isnan(share_within(predicted, torch.zeros(2, 2), 0.5)), "no return at all: nan is wanted"
+    assert math.isnan(float(share_within(predicted, torch.zeros(2, 2), 0.5))), "no return at all: nan is wanted"
     good = {name: share_within(scan.ranges, truth.ranges, 0.1) for name, scan in (("b", bilinear), ("n", network))}
     assert good["n"] > good["b"], "the network should have more points within 10 cm than bilinear"
 
@@ -286,11 +294,12 @@ def share_within(predicted, true, metres):
 # %% [markdown]
 # ### Exercise 3 · Catch a flying point
 #
-# ★★☆ · 15 minutes
+# ★☆☆ · 5 minutes
 #
-# Along a row, a prediction flies if it is farther than `gap` metres from *both* true ranges between which it lies:
-# write `flying(predicted, near, far, gap)`. It returns a mask (N,): whether `predicted` (N,) lies above `near + gap`
-# and below `far - gap`, with `near` and `far` (N,) the ranges of the two surfaces in any order.
+# A prediction flies if it lies *between* two surfaces and more than `gap` metres from either. Write
+# `flying(predicted, one, other, gap)`: a mask (N,) that tells which of the ranges `predicted` (N,) do, where `one` and
+# `other` (N,) are the true ranges of the two surfaces, in any order. (The metric does the same with all surfaces that
+# the 5 × 5 true pixels around hold, and a gap of 0.3 m.)
 #
 # <details><summary>Hint</summary>
 #
@@ -299,13 +308,13 @@ def share_within(predicted, true, metres):
 
 
 # %% tags=["exercise"]
-def flying(predicted, near, far, gap):
+def flying(predicted, one, other, gap):
     raise NotImplementedError
 
 
 # %% tags=["solution"]
-def flying(predicted, near, far, gap):
-    low, high = torch.minimum(near, far), torch.maximum(near, far)
+def flying(predicted, one, other, gap):
+    low, high = torch.minimum(one, other), torch.maximum(one, other)
     return (predicted > low + gap) & (predicted < high - gap)
 
 
@@ -313,8 +322,8 @@ def flying(predicted, near, far, gap):
 @check
 def _():
     predicted = torch.tensor([10.0, 20.0, 30.0, 20.0, 35.0])
-    near, far = torch.tensor([10.0, 10, 10, 30, 10]), torch.tensor([30.0, 30, 30, 10, 30])
-    found = flying(predicted, near, far, 1.0)
+    one, other = torch.tensor([10.0, 10, 10, 30, 10]), torch.tensor([30.0, 30, 30, 10, 30])
+    found = flying(predicted, one, other, 1.0)
     assert found.dtype == torch.bool, f"a mask of True and False is wanted, not {found.dtype}"
     assert not found[0], "a point on the near surface does not fly"
     assert not found[2], "a point on the far surface does not fly"
@@ -326,13 +335,13 @@ def _():
 
 
 # %% tags=["wrong"]
-def flying(predicted, near, far, gap):
-    return (predicted > near + gap) & (predicted < far - gap)
+def flying(predicted, one, other, gap):
+    return (predicted > one + gap) & (predicted < other - gap)
 
 
 # %% tags=["wrong"]
-def flying(predicted, near, far, gap):
-    return ((predicted - near).abs() > gap) & ((predicted - far).abs() > gap)
+def flying(predicted, one, other, gap):
+    return ((predicted - one).abs() > gap) & ((predicted - other).abs() > gap)
 
 
 # %% [markdown]
@@ -353,7 +362,7 @@ def flying(predicted, near, far, gap):
 # ## Summary
 #
 # 1. A network makes 16 beams into 128, or any other number, and never leaves the span of the measured neighbours.
-# 2. Bilinear interpolation invents points in empty air wherever two surfaces meet in the image.
+# 2. Bilinear interpolation puts points into empty air wherever two surfaces meet in the image.
 # 3. The network weighs the same four neighbours better. How, is what follows.
 #
 # ## Next

@@ -14,8 +14,7 @@
 # # 02 · Casting rays
 #
 # ![A street of a town in 16 x 1024 rays of the notebook's own kernel: above the ranges, below the cosine of the angle
-# at which each ray meets its surface, low on the road and on walls seen along their
-# length](pictures/02_casting_rays.png)
+# at which each ray meets its surface](pictures/02_casting_rays.png)
 #
 # **Goal.** You write the program that measures ranges: kernels in NVIDIA Warp with one thread per ray, from a flat
 # ground to a town of a million triangles.
@@ -30,7 +29,7 @@
 # | | |
 # |---|---|
 # | You know | [01 · What a LiDAR measures](01_what_a_lidar_measures.ipynb): directions, range images, no return |
-# | Time | 45 minutes to work through; half a minute to run |
+# | Time | 45 minutes, and 30 for the exercises; half a minute to run |
 # | Hardware | any computer; a CUDA GPU is used if there is one |
 
 # %%
@@ -106,9 +105,10 @@ draw_thread(
 #
 # - every argument has a type, and every variable keeps the type it begins with: `0.0` is a float, `0` an int;
 #   one that a loop changes begins as `float(0.0)` or `int(0)`;
-# - `wp.cos`, `wp.dot`, `wp.vec3` are Warp's; a `list`, a string or a PyTorch function have no place in it;
+# - `wp.cos`, `wp.dot`, `wp.vec3` are Warp's; a `list`, a string or a PyTorch function have no place in it. Write `wp.`
+#   even where another name happens to work;
 # - it returns nothing. It writes into arrays that it was given, and **no two threads write to the same element**:
-#   nobody says which comes last.
+#   nobody says which comes last. (On one core of a CPU threads run in turn, so that such a mistake may not show.)
 #
 # The decorator's two settings: Warp would also make the derivative of each kernel, for training. We need none here, and
 # `enable_backward=False` saves the time of compiling it. With `module="unique"` each kernel is compiled for itself;
@@ -141,18 +141,18 @@ assert torch.allclose(directions, sensor.directions().to(device), atol=1e-6)
 assert wp.from_torch(directions, dtype=wp.vec3).ptr == directions.data_ptr()  # one memory, two names
 
 # %% [markdown]
-# Compiling takes a second or so, and is done once: what was compiled lies in a folder of Warp's, and the next time the
-# first launch only loads it. (So it was where the outputs above come from, unless you have run the cell yourself.)
+# The very first time it takes a second or so. What was compiled lies in a folder of Warp's, and from then on the first
+# launch only loads it: the outputs printed in this course come from such a second run, so that you see milliseconds.
 #
-# From now on a small function of our own launches for us: N threads, tensors in, tensors
-# out; what has 3 columns is taken as vectors.
+# From now on a small function of our own launches for us: N threads, tensors in, tensors out. Tensors whose last
+# dimension is 3 are taken as vectors.
 
 
 # %%
 def run(kernel, threads, inputs, outputs):
     def to_warp(argument):
         if not isinstance(argument, torch.Tensor):
-            return argument  # numbers, vectors, handles
+            return argument  # numbers, vectors, and ids, which we shall meet in section 5
         vectors = argument.ndim > 1 and argument.shape[-1] == 3
         return wp.from_torch(argument, dtype=wp.vec3 if vectors else None)
 
@@ -169,14 +169,18 @@ def run(kernel, threads, inputs, outputs):
 #
 # $$r = -\frac{o_z}{d_z}.$$
 #
-# **Predict:** for which rays is that no answer?
+# **Predict:** for which two kinds of rays is that no answer?
+#
+# <details><summary>Answer</summary>
 #
 # - $d_z = 0$: the ray runs level and never comes down. A kernel does not stop at a division by zero, it goes on with
 #   infinity.
 # - $r < 0$: the formula knows lines, not rays. It finds the ground *behind* a ray that looks up.
 #
+# </details>
+#
 # Both are **misses**, and a miss is range 0. What kernels share is written as a `wp.func`. It can be called from Python
-# as well, which is handy to try it.
+# as well, which is handy for trying it out.
 
 
 # %%
@@ -223,7 +227,7 @@ assert torch.allclose(ground[0], 1.8 / torch.sin(-elevations[0]))  # h / sin(-el
 # <details><summary>Hint</summary>
 #
 # Put $\mathbf p = \mathbf o + r\,\mathbf d$ into the equation of the plane and solve for $r$. The dot product is
-# `wp.dot(a, b)`.
+# `wp.dot(a, b)`. A miss is `0.0`, not `0`, which would be an int.
 #
 # </details>
 #
@@ -322,16 +326,13 @@ def plane_range(origin: wp.vec3, direction: wp.vec3, normal: wp.vec3, offset: fl
 # The points of a sphere have distance $R$ from its centre $\mathbf c$. With $\mathbf v = \mathbf o - \mathbf c$ the ray
 # meets it where
 #
-# $$|\mathbf v + r\,\mathbf d|^2 = R^2 \quad\Longleftrightarrow\quad r^2 + 2\,(\mathbf v \cdot \mathbf d)\,r +
-# \mathbf v \cdot \mathbf v - R^2 = 0,$$
+# $$|\mathbf v + r\,\mathbf d|^2 = R^2 \quad\Longleftrightarrow\quad r^2 + 2\,b\,r + c = 0 \quad\text{with}\quad
+# b = \mathbf v \cdot \mathbf d, \quad c = \mathbf v \cdot \mathbf v - R^2,$$
 #
-# since $\mathbf d \cdot \mathbf d = 1$. A quadratic equation has two solutions, one, or none.
-#
-# **Predict:** five rays. Which solution is the range of each, if any?
+# since $\mathbf d \cdot \mathbf d = 1$. Such an equation has two solutions, $-b - \sqrt q$ and $-b + \sqrt q$ with
+# $q = b^2 - c$, one where $q = 0$, and none where $q < 0$.
 
 # %%
-figure, axes = plt.subplots(figsize=(8, 4.2), layout="constrained")
-axes.add_patch(plt.Circle((0, 0), 1, fill=False, linewidth=1.5))
 cases = {  # where the ray starts (it runs to the right), and its name
     "A: passes": (-3, 1.5),
     "B: touches": (-3, 1.0),
@@ -339,24 +340,41 @@ cases = {  # where the ray starts (it runs to the right), and its name
     "D: starts inside": (-0.3, -0.15),
     "E: starts behind": (1.6, -0.65),
 }
-for name, (x, y) in cases.items():
-    axes.annotate("", (x + 4.2, y), (x, y), arrowprops={"arrowstyle": "->", "color": GREY})
-    axes.plot(x, y, "s", color=BLUE, markersize=5)
-    axes.annotate(name, (x, y), (0, 5), textcoords="offset points", fontsize=9)
-    half = math.sqrt(max(1 - y * y, 0))
-    for number, root in enumerate(sorted({-half, half}) if abs(y) <= 1 else []):
-        ahead = root > x
-        axes.plot(root, y, "o", color=VERMILION if ahead else "white", markeredgecolor=VERMILION, markersize=7)
-        sign = ("$-$", "$+$")[number] if half else "$\\pm$"
-        axes.annotate(sign, (root, y), (8, -14), textcoords="offset points", bbox={"fc": "white", "lw": 0, "pad": 0})
-axes.set(xlim=(-3.3, 6), ylim=(-1.3, 1.9), aspect="equal", xticks=[], yticks=[])
-plt.show()
+
+
+def draw_rays(solved):
+    axes = plt.figure(figsize=(8, 4.2), layout="constrained").subplots()
+    axes.add_patch(plt.Circle((0, 0), 1, fill=False, linewidth=1.5))
+    for name, (x, y) in cases.items():
+        axes.annotate("", (x + 4.2, y), (x, y), arrowprops={"arrowstyle": "->", "color": GREY})
+        axes.plot(x, y, "s", color=BLUE, markersize=5)
+        axes.annotate(name, (x, y), (0, 5), textcoords="offset points", fontsize=9)
+        half = math.sqrt(max(1 - y * y, 0))
+        for number, root in enumerate(sorted({-half, half}) if solved and abs(y) <= 1 else []):
+            ahead = root > x
+            axes.plot(root, y, "o", color=VERMILION if ahead else "white", markeredgecolor=VERMILION, markersize=7)
+            sign = ("$-$", "$+$")[number] if half else "$\\pm$"
+            box = {"fc": "white", "lw": 0, "pad": 0}
+            axes.annotate(sign, (root, y), (8, -14), textcoords="offset points", bbox=box)
+    axes.set(xlim=(-3.3, 6), ylim=(-1.3, 1.9), aspect="equal", xticks=[], yticks=[])
+    plt.show()
+
+
+draw_rays(solved=False)
 
 # %% [markdown]
-# *In words: a circle and five rays to the right, each from a blue square; the solutions are dots, filled where they lie
-# ahead of the start, empty where they lie behind. A passes above and has none. B touches at the top, one solution. C
-# goes through, two solutions ahead. D starts inside: the minus solution lies behind, the plus solution ahead. E starts
-# to the right of the circle: both lie behind.*
+# *In words: a circle and five rays to the right, each from a blue square. A starts left of the circle and passes above
+# it. B starts left and touches its top. C starts left and goes through. D starts inside. E starts to the right.*
+#
+# **Predict:** which of the two solutions, with minus or with plus, is the range of each ray, if any?
+
+# %%
+draw_rays(solved=True)
+
+# %% [markdown]
+# *In words: the same, with the solutions as dots, filled where they lie ahead of the start, empty where they lie
+# behind. A has none. B has one. C has two ahead. D has the minus solution behind and the plus solution ahead. E has
+# both behind.*
 #
 # The range is the **smallest solution that is not behind**: minus for C (and B), plus for D, and a miss for A and E.
 #
@@ -364,7 +382,7 @@ plt.show()
 # |---|---|---|
 # | $\mathbf v = \mathbf o - \mathbf c$ | `v = origin - centre` | `origin: wp.vec3`, `centre: wp.vec3` |
 # | $b = \mathbf v \cdot \mathbf d$ | `b = wp.dot(v, direction)` | `direction: wp.vec3` |
-# | $q = b^2 - (\mathbf v \cdot \mathbf v - R^2)$ | `q = b * b - (wp.dot(v, v) - radius * radius)` | `radius: float` |
+# | $q = b^2 - c$ | `q = b * b - (wp.dot(v, v) - radius * radius)` | `radius: float` |
 # | $r = -b \mp \sqrt{q}$ | `-b - wp.sqrt(q)`, else `-b + wp.sqrt(q)` | `ranges_out[i]` |
 
 
@@ -471,12 +489,12 @@ def pole_range(origin: wp.vec3, direction: wp.vec3, x: float, y: float, radius: 
 # %% tags=["solution"]
 @wp.func
 def pole_range(origin: wp.vec3, direction: wp.vec3, x: float, y: float, radius: float) -> float:
-    v = wp.vec2(origin[0] - x, origin[1] - y)
+    v = wp.vec2(origin[0] - x, origin[1] - y)  # vec2: like vec3, with two components
     d = wp.vec2(direction[0], direction[1])
     a = wp.dot(d, d)
     b = wp.dot(v, d)
     q = b * b - a * (wp.dot(v, v) - radius * radius)
-    if a == 0.0 or q < 0.0:
+    if a == 0.0 or q < 0.0:  # without the first, 0 / 0: it is luck what wp.max makes of a NaN
         return 0.0
     root = wp.sqrt(q)
     if -b - root > 0.0:
@@ -561,14 +579,14 @@ def pole_range(origin: wp.vec3, direction: wp.vec3, x: float, y: float, radius: 
 # %% [markdown]
 # ### Exercise 3 · The nearest of many
 #
-# ★★★ · 12 minutes
+# ★★☆ · 12 minutes
 #
 # One launch per sphere writes and reads a whole image for each. Let one thread look at all spheres instead, and keep
 # the nearest hit in a variable of its own. Write a kernel with a `for` loop over the spheres, and the function
 # `cast_spheres(origin, directions, centres, radii)` which launches it: `origin` is a `wp.vec3`; `directions` (N, 3),
-# `centres` (S, 3) and `radii` (S,) are tensors on `device`. It returns the ranges (N,), 0 where nothing is met. S may
-# be
-# 0. Use `sphere_range` and `run` from above.
+# `centres` (S, 3) and `radii` (S,) are tensors on `device`. It returns the ranges (N,), 0 where nothing is met. There
+# may be no sphere at all. Use `sphere_range` and `run` from above, and write the kernel in the same cell, above the
+# function.
 #
 # <details><summary>Hint</summary>
 #
@@ -713,7 +731,7 @@ def cast_spheres_kernel(  # infinity where nothing is met
 # $$\mathbf o + r\,\mathbf d = \mathbf v_0 + u\,\mathbf e_1 + v\,\mathbf e_2,$$
 #
 # three equations, one for each of x, y, z, for the three unknowns $r, u, v$. Cramer's rule solves them with
-# determinants, and a determinant of three vectors is $\mathbf a \cdot (\mathbf b \times \mathbf c)$. With
+# determinants, and a determinant of three vectors is $\mathbf a \cdot (\mathbf b \times \mathbf c)$. With vectors
 # $\mathbf s = \mathbf o - \mathbf v_0$, $\mathbf p = \mathbf d \times \mathbf e_2$ and
 # $\mathbf q = \mathbf s \times \mathbf e_1$ (Möller and Trumbore, 1997):
 #
@@ -783,7 +801,7 @@ draw_thread(
 #
 # A test with known answers: a cube of 2 m around the sensor, two triangles a side, and the six rays along the axes.
 # Axis-aligned rays deserve a test of their own. They hit the very diagonal that the two triangles of a side share
-# ($u + v = 1$ or $v = 0$), and their zeros meet divisions.
+# ($u + v = 1$ or $v = 0$), and two of their components are 0, by which the boxes of the next section divide.
 #
 # **Predict:** what would happen to these rays if the test said `u <= 0.0 or v <= 0.0 or u + v >= 1.0`?
 
@@ -803,8 +821,8 @@ assert torch.equal(met, torch.ones_like(met))
 # With `<=` each of the two triangles would leave the diagonal to the other, and the rays would slip out between them.
 #
 # Now a town. `towns.build` makes the same one from the same name everywhere; `towns.traffic` puts cars and people
-# around us. Kernels compute in float32, which has 24 bits: far from the origin of the frame the millimetres get lost.
-# So we move the origin to the sensor first.
+# around us. Kernels compute in float32, which has 24 significant bits: 10 km from the origin of the frame its steps are
+# 1 mm, and the products in the test lose more. So we move the origin to the sensor first.
 
 # %%
 town = towns.build("town01")
@@ -842,8 +860,8 @@ print(f"the scan of {len(rays):,} rays would take {tests:.1e} tests, about {seco
 assert tests > 1e10
 
 # %% [markdown]
-# Seventeen thousand million tests for one small scan. Nearly all of them are in vain: a ray comes close to few
-# triangles.
+# Eighteen billion tests ($1.8 \cdot 10^{10}$) for one small scan. Nearly all of them are in vain: a ray comes close to
+# few triangles.
 #
 # ## 5. A tree of boxes
 #
@@ -851,8 +869,8 @@ assert tests > 1e10
 # all that is in it. Split the triangles in two halves, give each half a box, and go on until few are left: a *bounding
 # volume hierarchy*, BVH. A ray starts at the outermost box and only opens those that it meets.
 #
-# A small one, seen from above: the middles of a few thousand triangles around us, halved again and again across the
-# longer side.
+# A small one, seen from above along the axes of the town: the middles of a few thousand triangles around us, halved
+# again and again across the longer side. The smallest boxes are the *leaves* of the tree.
 
 
 # %%
@@ -869,7 +887,7 @@ def split(points, depth):
 
 
 def meets(direction, low, high):
-    """Whether a ray from the origin meets a box: it must be inside the box's span in x and in y at one time."""
+    """Whether a ray from the origin meets a box: having entered its span in x and in y, it has not yet left either."""
     with np.errstate(divide="ignore"):
         a, b = low / direction, high / direction
     return np.minimum(a, b).max() <= np.maximum(a, b).min() and np.maximum(a, b).min() >= 0
@@ -898,12 +916,14 @@ assert len(opened) < len(boxes) / 4
 
 # %% [markdown]
 # *In words: two plans of 60 by 60 m with grey dots, dense at trees, cars and houses, and an arrow from the middle to
-# the upper right. Left, all boxes of the tree, the smallest in orange-red, cover the plan. Right, only the boxes that
+# the upper right. Left, all boxes of the tree, the leaves in orange-red, lie over all dots. Right, only the boxes that
 # the arrow meets are left: a chain of small ones along it inside a few larger ones.*
 #
 # Warp has this tree. `wp.Bvh` builds it over boxes that we give it, one around each triangle. In a kernel
 # `wp.bvh_query_ray` starts a walk, and each `wp.bvh_query_next` finds the next triangle whose box the ray meets. It
-# takes a distance beyond which boxes need not be opened: once something is hit, all that is farther away.
+# takes a distance beyond which boxes need not be opened: once something is hit, all that is farther away. A kernel is
+# handed the tree's `id`, a number by which it finds the tree (`wp.uint64`, an integer of 64 bits); the Python object
+# has to live as long.
 #
 # **Predict:** how many of the million triangles does a ray still test on average?
 
@@ -1014,12 +1034,12 @@ draw_thread(
 # ## 6. A scan of a town
 #
 # `kernels.Mesh` wraps that kernel for tensors. What does it do beyond ours? It checks what it is given, takes float64
-# vertices and moves the origin itself, takes directions of any length and any batch shape, and shares the rays of a CPU
-# launch out among all cores (a launch of Warp uses one). `simulate.simulate` turns the rays of a sensor into the world,
-# finds their ranges, and leaves out what is nearer than the sensor's `min_range`. (Where that is faster on a CPU it
-# projects the triangles onto the image instead of casting rays: `Mesh.project`.)
+# vertices and moves the origin itself, takes directions of any length and any batch shape, and splits a CPU launch over
+# all cores (a launch of Warp itself uses one). `simulate.simulate` turns the rays of a sensor into the world, finds
+# their ranges, and leaves out what is nearer than the sensor's `min_range`. Where that is faster on a CPU it does not
+# cast rays at all but projects the triangles onto the image, as a renderer does (`Mesh.project`).
 #
-# **Predict:** will it find the same ranges as the kernel that you have just read?
+# **Predict:** at which rays could two programs that are both right disagree?
 
 # %%
 project_mesh = Mesh(vertices, triangles, device)
@@ -1037,7 +1057,7 @@ assert torch.allclose(axis.range, torch.ones_like(axis.range))  # the six rays a
 assert torch.allclose(axis.cosine, torch.ones_like(axis.cosine))
 
 # %% [markdown]
-# A few rays that graze an edge may fall to either side of it; all others agree.
+# Here all agree. Rays that graze an edge may fall to either side of it.
 #
 # **Predict:** where in the image are the cosines small?
 
@@ -1068,7 +1088,7 @@ assert abs(road - sine) < 0.03
 # Below, the cosines: the road is dark blue, nearly 0; house fronts are yellow where a ray meets them at right angles
 # and darken towards their ends; trees and cars are a mixture.*
 #
-# On a level road the cosine is the sine of the angle below the horizon: 0.12 at 7°. Two neighbouring rays touch such a
+# On a level road the cosine is the sine of the angle below the horizon: 0.12 at 7°. Two neighbouring beams touch such a
 # surface eight times as far apart as on a wall that faces us. Grazing rays are also those that a real sensor gets no
 # answer from; `simulate.Effects` has that, and noise, wide beams and a moving sensor besides.
 #
@@ -1091,17 +1111,9 @@ show_scene(plotter)
 # *In words: pale pieces of road, grey house fronts and cars from above, with gaps between them, and rows of orange-red
 # points on them: rings on the road, stripes on the walls.*
 #
-# The same kernels run on a GPU: nothing in them says where. Only the launch does, by its `device`.
-
-# %%
-for name in ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",):
-    there = Mesh(vertices, triangles, name)
-    answer = there.cast(torch.zeros(3, device=name), rays.to(name), sensor.max_range)
-    differ = ((answer.range - mine.to(name)).abs() > 0.01).sum()
-    print(f"{name}: {differ} of {len(rays):,} rays differ from {device}")
-    assert differ < 50
-
-# %% [markdown]
+# The same kernels run on a GPU: nothing in them says where. Only the launch does, by its `device`, which in this
+# notebook is the GPU if there is one.
+#
 # ## Summary
 #
 # 1. A kernel is written for one ray; the launch says how many threads run it. PyTorch tensors are handed over without a

@@ -13,24 +13,23 @@
 # %% [markdown]
 # # 03 · Between the pixels
 #
-# ![Two line charts. On a road the truth and the perspective blend lie on one curve, the bilinear blend bends away above
-# it. At an edge the truth jumps from near to far, and both blends climb slowly across the
-# gap.](pictures/03_between_the_pixels.png)
+# ![From above: a sensor, a wall at 10 m that ends between two laser beams, a wall at 30 m behind it, and three points
+# on a dotted ray between the beams](pictures/03_between_the_pixels.png)
 #
 # **Goal.** You ask a scan for directions that its sensor did not measure, answer by blending the four pixels around
 # them, and find out where no fixed blend can be right.
 #
 # **After this notebook you can**
 #
-# - turn a direction into a pixel coordinate, its four neighbours and their areas;
-# - blend ranges with the fused op `gather_blend`, and say what its scores and its prior do;
+# - say which four pixels surround a direction, and with which areas;
+# - blend ranges with the op `gather_blend`, and say what its scores and its prior do;
 # - show why 1/r, and not r, may be interpolated on a plane;
 # - show that points in empty air come from blending across an edge, and that one neighbour mostly knows better.
 #
 # | | |
 # |---|---|
 # | You know | [01 · What a LiDAR measures](01_what_a_lidar_measures.ipynb), [02 · Casting rays](02_casting_rays.ipynb) |
-# | Time | 40 minutes to work through; under a minute to run |
+# | Time | 30 minutes, and 30 for the exercises; under a minute to run |
 # | Hardware | any computer; a CUDA GPU is used if there is one |
 
 # %%
@@ -84,6 +83,9 @@ print(image.shape, f"{(scan.ranges > 0).float().mean():.0%} of the rays came bac
 # |---|---|---|---|---|
 # | pixel | (row-, column-) | (row-, column+) | (row+, column-) | (row+, column+) |
 #
+# where row- is the row rounded down and row+ the next one, and the same for columns. Columns wrap around the seam;
+# beyond the first and the last row the border row is repeated. (In code $t$ runs from 0 to 3.)
+#
 # The query cuts the cell between them into four rectangles. The *area* $a_t$ of a neighbour is that of the rectangle
 # **opposite** it, so that the closest neighbour has the largest area. With $f$ and $g$ for the fractions of row and
 # column:
@@ -92,8 +94,8 @@ print(image.shape, f"{(scan.ranges > 0).float().mean():.0%} of the rays came bac
 
 # %%
 query = torch.tensor([[4.3, 511.6]], device=device)  # (Q, 2)
-neighbours, offsets = gather_neighbours(image[None], query)  # (Q, 4, channels), (Q, 4, 2)
-areas = gather_blend(image, query, image.new_zeros(1, 4), "bilinear", return_weights=True)[1]
+neighbours, offsets = gather_neighbours(image[None], query)  # an image of one channel: (Q, 4, channels), (Q, 4, 2)
+areas = gather_blend(image, query, image.new_zeros(1, 4), "bilinear", return_weights=True)[1]  # see section 2
 
 figure, axes = plt.subplots(figsize=(4.6, 3.6), layout="constrained")
 f, g = 0.3, 0.6
@@ -118,7 +120,7 @@ plt.show()
 # The offsets say the same in pixels: query minus neighbour. A network will get them as input.
 
 # %%
-print("offsets:", offsets[0].tolist())
+print("offsets:", [[round(part, 3) for part in offset] for offset in offsets[0].tolist()])
 
 # %% [markdown]
 # ### Exercise 1 · Areas
@@ -150,6 +152,7 @@ def bilinear_areas(queries):
 def _():
     mine = bilinear_areas(torch.tensor([[4.3, 511.6]]))
     assert mine.shape == (1, 4), f"the shape should be (1, 4), one area for each neighbour; it is {tuple(mine.shape)}"
+    assert (mine >= 0).all(), f"an area is negative: {mine}; fractions are counted from the row and column below"
     assert torch.allclose(mine.sum(-1), torch.ones(1)), f"the areas sum to {mine.sum():.3f}, not to 1"
     wanted = torch.tensor([[0.28, 0.42, 0.12, 0.18]])
     assert not torch.allclose(mine, wanted.flip(-1), atol=1e-4), "the closest neighbour got the smallest area: opposite"
@@ -183,8 +186,8 @@ def bilinear_areas(queries):
 #
 # $$\hat r = \sum_{t=1}^{4} w_t\, r_t, \qquad w = \operatorname{softmax}(s + p)$$
 #
-# The *scores* $s$ are what a network will say (notebook 05). We have none yet: $s = 0$, and the *prior* $p$ decides
-# alone.
+# The *scores* $s$ are what a network will say (notebook 05). We have none yet: $s = 0$, and the *prior* $p$, four
+# numbers that are known beforehand, decides alone.
 #
 # | prior | $p_t$ | zero scores give |
 # |---|---|---|
@@ -193,14 +196,15 @@ def bilinear_areas(queries):
 # | `"perspective"` | $\log a_t - \log r_t$ | $1 \big/ \sum_t (a_t / r_t)$: bilinear interpolation of **1/r** |
 #
 # The last line takes a moment: $w_t \propto a_t / r_t$, so $\hat r = \sum (a_t/r_t)\,r_t \big/ \sum (a_t/r_t)$, and the
-# upper sum is $\sum a_t = 1$.
+# numerator is $\sum a_t = 1$.
 #
-# From the equation to the kernel that does it:
+# From the equation to the kernel that does it, `gather_blend_kernel` in `kernels/gather_blend.py`. (The op adds a batch
+# dimension B; `wp.Float` is any floating-point type.)
 #
 # | equation | line of code | kernel argument |
 # |---|---|---|
-# | $r_t$ | `image` | `image: wp.array3d[wp.Float]` |
-# | where $t = 1..4$ are | `queries` | `queries: wp.array3d[wp.Float]` |
+# | $r_t$ | `image` | `image: wp.array3d[wp.Float]`, (B, H, W) |
+# | where $t = 1..4$ are | `queries` | `queries: wp.array3d[wp.Float]`, (B, Q, 2) |
 # | $s$ | `scores` | `scores: wp.array2d[...]`, four at once |
 # | $p$ | `prior="perspective"` | `prior: int` |
 # | $\hat r$ | `gather_blend(image, queries, scores, prior)` | `ranges_out` |
@@ -260,10 +264,27 @@ road = along_column(AHEAD, rows)
 for name in ("bilinear", "perspective"):
     error = (road[name] - road["truth"]).abs()
     print(f"{name:>12}: at most {error.max():.2f} m off, {error.mean():.2f} m in the mean")
+
+
+def draw_lines(x, lines, **labels):
+    axes = plt.figure(figsize=(6, 3), layout="constrained").subplots()
+    for name, style in (("truth", "-"), ("bilinear", "--"), ("perspective", "-.")):
+        axes.plot(x, lines[name], style, color=COLOURS[name], linewidth=2, label=name)
+    axes.set(ylabel="range [m]", **labels)
+    axes.legend(frameon=False)
+    return axes
+
+
+axes = draw_lines(rows, road, title="on a road, from beam to beam", xlabel="row", xticks=[4, 5, 6])
+axes.plot([4, 5, 6], road["truth"][[0, 40, 80]], "o", color="black")  # the pixels
+plt.show()
 assert (road["perspective"] - road["truth"]).abs().max() < 0.1
 assert (road["bilinear"] - road["truth"]).mean() > 0.2  # too far
 
 # %% [markdown]
+# *In words: range over the row on a road. The truth (black) runs in two sagging arcs from 15 m over 20 m to 35 m. The
+# perspective blend (dash-dotted) covers it, the bilinear blend (dashed) is the chord above.*
+#
 # Bilinear interpolation draws the chord, and the truth sags below it: the blend is too far everywhere between the
 # beams. Here is why. Points of a plane satisfy $\mathbf n \cdot \mathbf p = c$. The sensor is the origin and
 # $\mathbf p = r\,\mathbf d$, so
@@ -277,8 +298,8 @@ assert (road["bilinear"] - road["truth"]).mean() > 0.2  # too far
 #
 # ★★☆ · 10 minutes
 #
-# Write `inverse_blend(r, a)`: from ranges r (Q, 4) and areas a (Q, 4) the bilinear blend of 1/r, inverted (Q,). Then
-# return the weights $w_t$ (Q, 4) as well, with which it is a blend of *ranges*.
+# Write `inverse_blend(r, a)`, for ranges r (Q, 4) and areas a (Q, 4). It returns a pair: the inverse of the bilinear
+# blend of 1/r, (Q,), and the weights $w_t$, (Q, 4), with which the same is a blend of *ranges*.
 #
 # <details><summary>Hint 1</summary>
 #
@@ -306,7 +327,9 @@ def inverse_blend(r, a):
 def _():
     r = torch.tensor([[10.0, 10.0, 20.0, 20.0], [7.0, 7.0, 7.0, 7.0], [5.0, 50.0, 50.0, 50.0]])
     a = torch.tensor([[0.25, 0.25, 0.25, 0.25], [0.1, 0.2, 0.3, 0.4], [1.0, 0.0, 0.0, 0.0]])
-    blended, weights = inverse_blend(r, a)
+    answer = inverse_blend(r, a)
+    assert isinstance(answer, tuple), "return a pair: ranges (Q,) and weights (Q, 4)"
+    blended, weights = answer
     assert blended.shape == (3,), f"one range for each query is wanted: (3,), not {tuple(blended.shape)}"
     assert abs(blended[0] - 15.0) > 1e-3, "between 10 m and 20 m you have 15 m: that is the blend of ranges, not of 1/r"
     assert abs(blended[0] - 0.075) > 1e-3, "0.075 is the blended inverse range, in 1/m: one step is missing"
@@ -353,42 +376,33 @@ edge_rows, edge_columns = strongest // spread.shape[1], strongest % spread.shape
 
 def across(row, column, parts, row_part=0.5):
     """Truth, blends and neighbours of queries between two columns: {name: (Q,) or (Q, 4) metres}."""
-    elevation = torch.tensor(sensor.elevations[row : row + 2]).lerp_(torch.tensor(sensor.elevations[row + 1]), row_part)
-    azimuths = torch.tensor(sensor.azimuths[column : column + 2])
-    azimuth = torch.lerp(azimuths[0], azimuths[1], parts.double())
+    low, high = sensor.elevations[row : row + 2]
+    left, right = sensor.azimuths[column : column + 2]
+    azimuth = left + parts.double() * (right - left)
+    elevation = torch.full_like(azimuth, low + row_part * (high - low))
     queries = torch.stack((torch.full_like(parts, row + row_part), column + parts), -1).to(device)
     zero = image.new_zeros(len(parts), 4)
     found = {prior: gather_blend(image, queries, zero, prior).cpu() for prior in ("bilinear", "perspective")}
     found["neighbours"] = gather_neighbours(image[None], queries)[0][..., 0].cpu()
-    return {"truth": truth_at(elevation[0].expand_as(azimuth), azimuth).cpu(), **found}
+    return {"truth": truth_at(elevation, azimuth).cpu(), **found}
 
 
 parts = torch.linspace(0, 1, 81)
 edge = across(int(edge_rows[0]), int(edge_columns[0]), parts)
 print("neighbours [m]:", [round(r, 1) for r in edge["neighbours"][0].tolist()])
 
-# %% tags=["goal"]
-figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.4), layout="constrained")
-for axes, x, lines in ((left, rows, road), (right, parts, edge)):
-    for name, style in (("truth", "-"), ("bilinear", "--"), ("perspective", "-.")):
-        axes.plot(x, lines[name], style, color=COLOURS[name], linewidth=2, label=name)
-    axes.set_ylabel("range [m]")
-left.plot([4, 5, 6], road["truth"][[0, 40, 80]], "o", color="black", label="pixels")
-left.set(title="on a road, from beam to beam", xlabel="row", xticks=[4, 5, 6])
-right.set(title="across an edge, from column to column", xlabel="part of the way")
-left.legend(frameon=False)
+draw_lines(parts, edge, title="across an edge, from column to column", xlabel="part of the way")
 plt.show()
 
 # %% [markdown]
-# *In words: left, range over the row on a road: the truth (black) runs in two sagging arcs from 15 m over 20 m to 34 m;
-# the perspective blend (dash-dotted) covers it, the bilinear blend (dashed) is the chord above. Right, across an edge:
-# the truth jumps once from one level to the other; both blends climb from one end of the cell to the other.*
+# *In words: range over the way across an edge. The truth jumps once from one level to the other; both blends climb from
+# one end of the cell to the other.*
 #
 # The truth chooses, the blends compromise. Is there perhaps something in the gap? We stand at a made-up point and
 # cast rays in all directions: the shortest range says how far the nearest surface is.
 
 # %%
-middle = across(int(edge_rows[0]), int(edge_columns[0]), torch.tensor([0.4]))
+middle = across(int(edge_rows[0]), int(edge_columns[0]), torch.tensor([0.5]))
 row, column = int(edge_rows[0]), int(edge_columns[0])
 angle = [torch.tensor(t[i : i + 2]).mean() for t, i in ((sensor.elevations, row), (sensor.azimuths, column))]
 forward = (pose[:3, :3] @ angles_to_directions(*angle).double()).float().to(device)
@@ -406,13 +420,15 @@ for prior in ("bilinear", "perspective"):
 # somewhere between two columns, and one at 30 m behind it; the columns are drawn 8° apart so that you can see them.
 
 
-# %%
+# %% tags=["goal"]
 def draw_edge(edge=0.6, offset=0.4):
     """From above: two pixels, a query between them, and where each method puts its point."""
     near, far, apart = 10.0, 30.0, math.radians(8)
     pair = torch.tensor([[near, far], [near, far]])  # two rows, two columns
     query = torch.tensor([[0.5, offset]])
-    found = {prior: gather_blend(pair, query, torch.zeros(1, 4), prior, False).item() for prior in list(COLOURS)[:2]}
+    found = {
+        prior: gather_blend(pair, query, torch.zeros(1, 4), prior, wrap=False).item() for prior in list(COLOURS)[:2]
+    }
     found["truth"] = near if offset < edge else far
     axes = plt.figure(figsize=(9, 2.6), layout="constrained").subplots()
 
@@ -443,18 +459,28 @@ draw_edge()
 # 30 m. A dotted ray between them: the truth lies on the near wall, bilinear at 18 m and perspective at 13.6 m float in
 # the gap.*
 #
-# **Predict:** for which edges is a blend right? Then move the sliders (in a running notebook).
+# **Predict:** the edge moves to 0.2, on the other side of the query. What changes?
+
+# %%
+draw_edge(edge=0.2)
+
+# %% [markdown]
+# *In words: the near wall now ends before the dotted ray, and the truth lies on the far wall. Bilinear and perspective
+# stay where they were, at 18 m and 13.6 m.*
+#
+# In a running notebook, move both yourself:
 
 # %%
 _ = interact(draw_edge, edge=(0.0, 1.0, 0.05), offset=(0.0, 1.0, 0.05))
 
 # %% [markdown]
-# The position of the edge moves nothing but the truth: **the four numbers do not contain it.** A blend that knows only
-# the areas and the four ranges cannot be right for every edge.
+# The edge moves nothing but the truth: **the four ranges do not contain it.** Right is 10 m or 30 m, and the blends say
+# something else wherever the query is not on a pixel.
 #
 # ## 5. One neighbour mostly knows
 #
-# Bad luck at one edge? The 100 strongest edges, each asked at a random place between its columns:
+# Bad luck at one edge? Here are the 100 strongest, each asked at a random place between its columns. Once we pick, with
+# the truth in hand, the better of the two blends, and once the best of the four neighbours:
 
 # %%
 generator = torch.Generator().manual_seed(1)
@@ -477,7 +503,7 @@ assert (errors["the best of the neighbours"] < 0.5).sum() > 80
 # %% [markdown]
 # At most edges the right answer was there all the time: one of the four neighbours has it. So the question is not
 # *which value?* but **which neighbour, how much?** That is what scores are for. Softmax turns them into weights: a
-# score that is larger by 5 gets a weight 150 times as large.
+# score larger by 5 gets a weight 150 times as large.
 #
 # ### Exercise 3 · Be the network
 #
@@ -485,7 +511,8 @@ assert (errors["the best of the neighbours"] < 0.5).sum() > 80
 #
 # Write `choose(r, truth)`: scores (Q, 4) for which `gather_blend` *without* a prior comes within 0.1 m of the neighbour
 # that is closest to the truth, from the ranges r (Q, 4) and the truth (Q,). A network has to guess what you may look
-# up. Ranges are below 100 m, so a weight of $10^{-4}$ on a wrong neighbour is still 1 cm.
+# up. (Without a prior, the weights are the softmax of the scores alone.) Ranges are at most 100 m, so a weight of
+# $10^{-4}$ on a wrong neighbour moves the answer by up to 1 cm.
 #
 # <details><summary>Hint</summary>
 #
@@ -510,6 +537,7 @@ def choose(r, truth):
 def _():
     scores = choose(neighbours, truth)
     assert scores.shape == neighbours.shape, f"scores should be {tuple(neighbours.shape)}, not {tuple(scores.shape)}"
+    assert scores.is_floating_point(), f"scores are floating-point numbers, yours {scores.dtype}: .float()"
     assert scores.isfinite().all(), "a score is not finite: softmax makes NaN of two infinite ones"
     closest = neighbours.gather(1, (neighbours - truth[:, None]).abs().argmin(1, keepdim=True))[:, 0]
     blended = (scores.softmax(-1) * neighbours).sum(-1)
@@ -538,15 +566,16 @@ def choose(r, truth):
 # %% [markdown]
 # ### Exercise 4 · The best that any weights can do
 #
-# ★★★ · 10 minutes
+# ★★☆ · 5 minutes
 #
 # Weights are positive and sum to 1, so a blend lies between the smallest and the largest neighbour, whatever a network
-# says. Write `best_blend(r, truth)`: the range (Q,) closest to the truth (Q,) that any weights can give for neighbours
-# r (Q, 4). How much of the error at edges is left?
+# says. Write `best_blend(r, truth)`: the range (Q,) closest to the truth (Q,) that blends of the neighbours r (Q, 4)
+# can come as close to as you like. The check prints how much of the error at edges is left.
 #
 # <details><summary>Hint</summary>
 #
-# If the truth lies between the extremes, some weights hit it exactly. If not, the nearest extreme is the best.
+# If the truth lies between the extremes, `r.amin(-1)` and `r.amax(-1)`, some weights hit it. If not, the nearest
+# extreme is the best.
 # </details>
 
 
@@ -571,6 +600,8 @@ def _():
     assert abs(found[2] - 5) < 1e-5, f"four neighbours at 5 m blend to 5 m and nothing else; you have {found[2]}"
     left = (best_blend(neighbours, truth) - truth).abs().median()
     assert left <= errors["the best of the neighbours"].median(), "weights can do at least what one neighbour does"
+    print(f"median error at the 100 edges: {left:.2f} m with the best weights,", end=" ")
+    print(", ".join(f"{error.median():.2f} m with {name}" for name, error in errors.items()))
 
 
 # %% tags=["wrong"]
@@ -588,7 +619,7 @@ def best_blend(r, truth):
 #
 # 1. Between pixels an answer is a blend of four neighbours: softmax of scores plus a prior. One kernel does all of it.
 # 2. On a plane 1/r is linear in the direction: the *perspective* blend is nearly exact, the bilinear one bends.
-# 3. At an edge fixed blends make up points in empty air, since the four ranges do not say where the edge is.
+# 3. At an edge fixed blends put points into empty air, since the four ranges do not say where the edge is.
 # 4. One neighbour mostly has the answer. Somebody has to choose: from the picture around the query, not from four
 #    numbers.
 #
