@@ -164,9 +164,10 @@ def convergence(study: Study) -> None:
     figure = Figure(figsize=(10, 3.2), layout="constrained")
     for axis, (x, y) in zip(figure.subplots(1, 3), (("step", "iou"), ("seconds", "iou"), ("step", "mae")), strict=True):
         for name in ("liif", "iln"):
-            runs = [[r for r in rows if r["model"] == name and r["seed"] == seed] for seed in range(study.seeds)]
-            values = np.array([[row[y] for row in run] for run in runs])
-            at = np.mean([[row[x] for row in run] for run in runs], axis=0)
+            runs = [{r["step"]: r for r in rows if r["model"] == name and r["seed"] == s} for s in range(study.seeds)]
+            steps = sorted(set.intersection(*(set(run) for run in runs)))
+            values = np.array([[run[step][y] for step in steps] for run in runs])
+            at = np.mean([[run[step][x] for step in steps] for run in runs], axis=0)
             axis.plot(at, values.mean(0), color=_COLOURS[name], label=name)
             axis.fill_between(at, values.min(0), values.max(0), color=_COLOURS[name], alpha=0.25)
         axis.set_xlabel(x)

@@ -243,7 +243,6 @@ def train(
     places = [(kind, place) for kind, pairs in training.pairs.items() for place in range(number, len(pairs), processes)]
     scans: DataLoader[tuple[str, int]] = DataLoader(places, batch_size=None)  # type: ignore[arg-type]
     best = ModelCheckpoint(folder, "best", monitor="val/iou", mode="max", enable_version_counter=False)
-    last = ModelCheckpoint(folder, "last", every_n_train_steps=CHECKPOINT_EVERY, enable_version_counter=False)
     trainer = lightning.Trainer(
         max_steps=steps,
         precision=PRECISION,
@@ -255,7 +254,7 @@ def train(
         log_every_n_steps=10,
         default_root_dir=folder,
         logger=[kind(out, name=name, version=f"from-step-{start}") for kind in (CSVLogger, TensorBoardLogger)],
-        callbacks=[best, last, TQDMProgressBar()],
+        callbacks=[best, _Last(folder / "last.ckpt"), TQDMProgressBar()],
         enable_model_summary=False,
     )
     batches = DataLoader(samples, batch_size=None, **_workers(device))
@@ -272,6 +271,25 @@ def train(
         for file in folder.glob("*.ckpt"):
             file.unlink()
     return figures
+
+
+class _Last(lightning.Callback):
+    """Keeps what an interrupted run goes on from: every so many steps, and after each validation.
+
+    Never between a step and its validation, which the run that goes on would leave out.
+    """
+
+    def __init__(self, file: Path):
+        self.file = file
+
+    def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
+        step = trainer.global_step
+        if step % CHECKPOINT_EVERY == 0 and step % trainer.val_check_interval:
+            trainer.save_checkpoint(self.file)
+
+    def on_validation_end(self, trainer: lightning.Trainer, *_: Any) -> None:
+        if trainer.state.fn == "fit":
+            trainer.save_checkpoint(self.file)
 
 
 def _samples(

@@ -13,11 +13,10 @@
 # %% [markdown]
 # # 07 · Attention among four neighbours
 #
-# ![Left, ranges along a row across the edge of a pillar: bilinear interpolation draws a ramp, the network a step, as
-# the truth is. Right, the weights of the four neighbours while the query crosses the cell of that edge: they switch
-# from the two left pixels to the two right ones](pictures/07_attention.png)
+# ![Left, ranges along a row across the edge of a pillar, by three methods. Right, the weights of the four neighbours
+# while the query crosses the cell of that edge, as stacked bands](pictures/07_attention.png)
 #
-# **Goal.** You build the network that says the scores, find out what attention adds to it, and cut its work to half
+# **Goal.** You build the network that says the scores, see what attention can add to it, and cut its work to half
 # without changing what it computes.
 #
 # **After this notebook you can**
@@ -30,7 +29,7 @@
 # | | |
 # |---|---|
 # | You know | weights (05), a fused op (06); `nn.Module`, `nn.Linear`, `nn.LayerNorm` |
-# | Time | 45 minutes to work through, exercises included; one to two minutes to run |
+# | Time | 40 minutes, and 25 for the exercises; one to two minutes to run |
 # | Hardware | any computer; a CUDA GPU is used if there is one |
 #
 # Each section asks you for a prediction. Write it down before you run the next cell.
@@ -62,25 +61,26 @@ device = "cuda" if torch.cuda.is_available() else "cpu"
 # ## 1. Four tokens
 #
 # The encoder gives every pixel a feature vector $z$ of $C = 64$ numbers. A query asks its four neighbours. Each becomes
-# a *token*: its feature, plus where the query lies as seen from it, the offset $q_t$ in pixels, brought to 64 numbers
-# by a linear layer (the *position embedding*):
+# a *token*: its feature, plus where the query lies as seen from it, the offset $\delta_t$ in pixels (notebook 04's
+# $\Delta\mathbf q_t$), brought to 64 numbers by a linear layer (the *position embedding*):
 #
-# $$x_t = z_t + W q_t + b, \qquad t = 1 \ldots 4$$
+# $$x_t = z_t + W \delta_t + b, \qquad t = 1 \ldots 4$$
 #
 # D *blocks* follow, each made of two steps which add to the tokens what they found:
 #
 # $$x \leftarrow x + O\,\operatorname{attend}(M\,\mathrm{LN}(x)), \qquad x \leftarrow x + \mathrm{FF}(\mathrm{LN}(x))$$
 #
 # LN is a layer norm. $M$ makes a query, a key and a value of each token, $O$ brings the result back, FF is a linear
-# layer, GELU, and another linear layer. In each of 8 *heads* token i asks all tokens j how well their keys fit its
-# query, and takes the mean of their values by these weights:
+# layer, GELU, and another linear layer. In each of 8 *heads*, which share the 64 numbers, $d = 64 / 8 = 8$ for each,
+# token i asks all tokens j how well their keys fit its query, and takes the mean of their values by these weights:
 #
-# $$P_{ij} = \operatorname{softmax}_j\!\left(\frac{\mathbf q_i \cdot \mathbf k_j}{\sqrt{8}}\right), \qquad
+# $$P_{ij} = \operatorname{softmax}_j\!\left(\frac{\mathbf q_i \cdot \mathbf k_j}{\sqrt{d}}\right), \qquad
 #   \operatorname{attend}_i = \sum_j P_{ij}\,\mathbf v_j$$
 #
 # (Two things are called query here: the direction that is asked of the network, and $\mathbf q_i$, which a token asks
-# of the other tokens. Both words are usual.) At last a head scores each token, and the softmax of the four scores
-# weighs the ranges, as in notebook 05. All of it fits one screen:
+# of the other tokens. Both words are usual.) At last a linear layer scores each token (`head` in the code, which has
+# nothing to do with the 8 heads), and the softmax of the four scores weighs the ranges, as in notebook 05. All of it
+# fits one screen:
 
 
 # %%
@@ -96,7 +96,7 @@ class Block(nn.Module):
         )
 
     def forward(self, x):  # (Q, 4, C)
-        q, k, v = self.qkv(self.norm(x)).unflatten(-1, (3, self.heads, -1)).unbind(-3)  # (Q, 4, heads, D) each
+        q, k, v = self.qkv(self.norm(x)).unflatten(-1, (3, self.heads, -1)).unbind(-3)  # (Q, 4, heads, d) each
         logits = torch.einsum("nihd,njhd->nhij", q, k) / math.sqrt(q.shape[-1])
         attended = torch.einsum("nhij,njhd->nihd", logits.softmax(-1), v).flatten(-2)
         x = x + self.out(attended)
@@ -137,7 +137,7 @@ def copy_of(model):
 
 def ask(decoder, model, image, queries):
     """Ranges of one image (H, W) along queries (Q, 2): the encoder is the model's, what follows is ours."""
-    features = model.encode(image[None], True).features
+    features = model.encode(image[None], wrap=True).features
     z, offsets = gather_neighbours(features, queries[None])
     ranges, _ = gather_neighbours(image[None, None], queries[None])
     return decoder(z[0], offsets[0], ranges[0, ..., 0])
@@ -155,13 +155,14 @@ for depth in (0, 1, 2):
 
 # %% [markdown]
 # ### Exercise 1 · Attention that ignores
+#
 # ★★☆ · 10 minutes
 #
 # A laser that met nothing has no surface to speak of. Write one head of attention in which some of the four tokens are
-# not listened to: `attend(q, k, v, valid)` with `q`, `k`, `v` (N, 4, D) and `valid` (N, 4), True for tokens to listen
+# not listened to: `attend(q, k, v, valid)` with `q`, `k`, `v` (N, 4, d) and `valid` (N, 4), True for tokens to listen
 # to. Token i takes the mean of the values of the *valid* tokens j, weighed by the softmax of
-# $\mathbf q_i \cdot \mathbf k_j / \sqrt D$ over these j alone. Where no token is valid the result is 0. Return (N, 4,
-# D).
+# $\mathbf q_i \cdot \mathbf k_j / \sqrt d$ over these j alone. Where no token is valid the result is 0. Return (N, 4,
+# d).
 #
 # <details><summary>Hint: leaving a token out</summary>
 #
@@ -194,11 +195,11 @@ def _():
     generator = torch.Generator().manual_seed(1)
     q, k, v = torch.randn(3, 6, 4, 8, generator=generator)
     everyone = torch.ones(6, 4, dtype=torch.bool)
-    together = torch.stack((q, k, v), 2).flatten(2)  # (6, 4, 3 D)
+    together = torch.stack((q, k, v), 2).flatten(2)  # (6, 4, 3 d)
     answer = attend(q, k, v, everyone)
     assert answer.shape == v.shape, f"the result has shape {tuple(answer.shape)}; it should be {tuple(v.shape)}"
     same = torch.allclose(answer, attend_neighbours(together, heads=1, backend="torch"), atol=1e-5)
-    assert same, "with all tokens valid it differs from attention: is the sum over j, and the scale 1/sqrt(D)?"
+    assert same, "with all tokens valid it differs from attention: is the sum over j, and the scale 1/sqrt(d)?"
     turned = [2, 0, 3, 1]
     moved = attend(q[:, turned], k[:, turned], v[:, turned], everyone)
     assert torch.allclose(moved, answer[:, turned], atol=1e-5), (
@@ -211,7 +212,7 @@ def _():
     loud = v.clone()
     loud[:, 1] = 1e6
     assert torch.allclose(attend(q, k, v, some), attend(q, k, loud, some)), (
-        "token 1 is not valid, and yet was listened to"
+        "token 1 is not valid, and yet was listened to: is the mask along j?"
     )
     ones = attend(q, k, torch.ones_like(v), some)
     assert torch.allclose(ones, torch.ones_like(v), atol=1e-5), "values of 1: the weights of the valid tokens sum to 1"
@@ -242,9 +243,9 @@ def attend(q, k, v, valid):  # exp overflows
 # ## 2. What D = 0 cannot know
 #
 # Without blocks nothing passes between the tokens: the score of a neighbour is a function of that neighbour alone,
-# $s_t = g(z_t + W q_t + b)$. The weights are still a softmax over all four, so they do compete. But how much one is
-# preferred over another, $w_0 / w_1 = e^{s_0 - s_1}$, cannot depend on the other two. With a block, $s_0$ may say "I am
-# the nearer of two surfaces" or "all four of us agree".
+# $s_t = g(z_t + W \delta_t + b)$. The weights are still a softmax over all four, so they do compete. But how much one
+# is preferred over another, $w_0 / w_1 = e^{s_0 - s_1}$, cannot depend on the other two. With a block, $s_0$ may say "I
+# am the nearer of two surfaces" or "all four of us agree".
 #
 # **Predict:** we change the feature of neighbour 3 only. Which scores change for D = 0, for D = 1?
 
@@ -273,7 +274,7 @@ plt.show()
 # change a little at D = 1, and not at all at D = 0.*
 #
 # The encoder softens this: a feature has seen the pixels around its own, so neighbours know of each other even at D =
-# 0. Attention tells them apart at the very end, when the query is known.
+# 0. But the encoder does not know the query. Attention compares the four once the query is known.
 #
 # ## 3. What it costs
 #
@@ -310,10 +311,8 @@ assert count(0) == 512 + 256
 assert count(1) == 512 + 49152 + 2 * 1024 + 16384 + 32768 + 256
 
 # %% [markdown]
-# Attention itself, the 4 × 4, is the smallest part of a block by this count; nearly half is $M$. By the clock it is
-# another matter. Matrices of 64 × 192 keep the processor's multipliers busy. A 4 × 4 product is far too small for a
-# matrix library, which packs, copies and transposes for each: here the count misleads. So it gets a kernel of its own,
-# with one thread per query and head.
+# Attention itself, the 4 × 4, is the smallest part of a block by this count; nearly half is $M$, with 24 times as many
+# multiply-adds. The 4 × 4 also gets a kernel of its own, with one thread per query and head.
 
 
 # %%
@@ -321,17 +320,18 @@ assert count(1) == 512 + 49152 + 2 * 1024 + 16384 + 32768 + 256
 def softmax4(s: wp.vec4):
     """Weights of four scores, see notebook 06."""
     w = s
+    largest = wp.max(s)
     for t in range(4):
-        w[t] = wp.exp(s[t] - wp.max(s))
+        w[t] = wp.exp(s[t] - largest)
     return w / (w[0] + w[1] + w[2] + w[3])
 
 
 @wp.kernel(module="unique", enable_backward=False)
 def _attend_kernel(
     # in
-    qkv: wp.array4d[float],  # (Q, 12, heads, D): q, k, v of neighbour 0, then those of neighbour 1 ...
+    qkv: wp.array4d[float],  # (Q, 12, heads, d): q, k, v of neighbour 0, then those of neighbour 1 ...
     # out
-    attended_out: wp.array4d[float],  # (Q, 4, heads, D)
+    attended_out: wp.array4d[float],  # (Q, 4, heads, d)
 ):
     n, h = wp.tid()
     for i in range(4):
@@ -351,7 +351,7 @@ def attend_by_kernel(qkv):
     attended = torch.empty_like(rows[:, :4])
     stream = wp.stream_from_torch(torch.cuda.current_stream()) if device == "cuda" else None
     arrays = wp.from_torch(rows), wp.from_torch(attended)
-    wp.launch(_attend_kernel, rows.shape[::2][:2], arrays[:1], arrays[1:], device=device, stream=stream)
+    wp.launch(_attend_kernel, (len(rows), 8), arrays[:1], arrays[1:], device=device, stream=stream)
     return attended.flatten(2)
 
 
@@ -359,7 +359,7 @@ def attend_by_kernel(qkv):
 draw_thread(
     "_attend_kernel: thread (n, h) lets the four neighbours of query n attend to each other in head h",
     reads=[Cells("qkv[n], heads side by side", (12, 12), [(i, j) for i in range(12) for j in (3, 4, 5)])],
-    steps="P = softmax(q kᵀ / √D)\n4 x 4, in registers\nmean of v by P",
+    steps="P = softmax(q kᵀ / √d)\n4 x 4, in registers\nmean of v by P",
     writes=[Cells("attended_out[n]", (4, 12), [(i, j) for i in range(4) for j in (3, 4, 5)])],
 )
 
@@ -367,6 +367,8 @@ draw_thread(
 # *In words: on the left the twelve rows of one query: query, key and value of each of four neighbours. The thread reads
 # the columns of its own head from all of them, and writes the same columns of four rows on the right. Its neighbours do
 # the other heads.*
+#
+# **Predict:** which takes longer, $M$ or the 4 × 4? Does it matter with what the 4 × 4 is computed?
 
 
 # %%
@@ -406,44 +408,49 @@ for name, way in ways.items():
     print(f"{name:>35}: {milliseconds(way):6.1f} ms for {len(qkv):,} queries")
 
 # %% [markdown]
-# A step with a twenty-fourth of the multiply-adds can take longer than the matrix product, if it is written for a
-# library of large matrices.
+# With a twenty-fourth of the multiply-adds the 4 × 4 by `einsum` takes longer than the matrix product. Matrices of 64 ×
+# 192 keep the processor's multipliers busy; a 4 × 4 is far too small for a library of large matrices. Here the count
+# misleads. From now on we use `attend_neighbours`.
 #
 # ## 4. Hoisting: projections per pixel
 #
 # Now $M$, nearly half of the count of section 3. It is applied to 1,048,576 tokens, but these are made of only 16,384
 # pixels: 64 tokens share each feature $z$ and differ by their offsets alone. If there were no layer norm,
-# $M(z + Wq + b)$ would be $M(z + b) + (MW)\,q$: the first part once per *pixel*, the second a product with two numbers.
-# Moving work out of a loop in which it does not change is called *hoisting*.
+# $M(z + W\delta + b)$ would be $M(z + b) + (MW)\,\delta$: the first part once per *pixel*, the second a product with
+# two numbers. Moving work out of a loop in which it does not change is called *hoisting*.
 #
-# The layer norm is in the way: it divides by a standard deviation which depends on z and q together,
+# The layer norm is in the way: it divides by a standard deviation which depends on $z$ and $\delta$ together,
 #
 # $$\mathrm{LN}(x) = \gamma\,\frac{x - \bar x}{\sqrt{\operatorname{var}(x) + \varepsilon}} + \beta$$
 #
-# But look at how. Subtracting the mean over the C channels is linear. Write $\mathbf{\hat z} = (z + b) - \text{mean}$,
-# and $\hat W$ for $W$ whose columns have lost their means. Then $x - \bar x = \mathbf{\hat z} + \hat W q$, and
+# **Predict:** can it be hoisted all the same, without an approximation?
 #
-# $$C \operatorname{var}(x) = \lVert \mathbf{\hat z} + \hat W q \rVert^2
+# Look at how it is in the way. Subtracting the mean over the C channels is linear. Write
+# $\mathbf{\hat z} = (z + b) - \text{mean}$, and $\hat W$ for $W$ whose columns have lost their means. Then
+# $x - \bar x = \mathbf{\hat z} + \hat W \delta$, and
+#
+# $$C \operatorname{var}(x) = \lVert \mathbf{\hat z} + \hat W \delta \rVert^2
 #   = \underbrace{\mathbf{\hat z}^\top \mathbf{\hat z}}_{\text{1 number}}
-#   + 2\, q^\top \underbrace{\hat W^\top \mathbf{\hat z}}_{u:\ \text{2 numbers}}
-#   + q^\top \underbrace{\hat W^\top \hat W}_{N:\ 2 \times 2} q$$
+#   + 2\, \delta^\top \underbrace{\hat W^\top \mathbf{\hat z}}_{u:\ \text{2 numbers}}
+#   + \delta^\top \underbrace{\hat W^\top \hat W}_{N:\ 2 \times 2} \delta$$
 #
 # a quadratic in the offset, with three numbers that belong to the pixel and a matrix that belongs to the network. And
 #
-# $$M\,\mathrm{LN}(x) = \frac{A + B q}{\sigma} + c, \qquad
+# $$M\,\mathrm{LN}(x) = \frac{A + B \delta}{\sigma} + c, \qquad
 #   A = M \gamma \mathbf{\hat z}, \quad B = M \gamma \hat W, \quad c = M \beta$$
+#
+# where $\gamma$ multiplies channel by channel. It is exact.
 #
 # | equation | line of code | kernel argument |
 # |---|---|---|
 # | $A$, per pixel | `(z_hat * gamma) @ M.T` | `pixels` (P, 4 C + 16), first 3 C columns |
-# | $\hat z^\top \hat z,\ u$, per pixel | `(z_hat**2).sum(-1)`, `z_hat @ W_hat` | `moments`: columns 4 C to 4 C + 2 |
+# | $\hat z^\top \hat z,\ u$, per pixel | `(z_hat**2).sum(-1)`, `z_hat @ W_hat` | `pixels`, columns 4 C to 4 C + 2 |
 # | $B$ | `(M * gamma) @ W_hat` | `slope` (2, 4 C), first 3 C columns |
 # | $c$, $N$ | `M @ beta`, `W_hat.T @ W_hat` | `shift` (3 C,), `gram` (2, 2) |
 #
-# The arguments are those of the library's `_attend_kernel` in `kernels/neighbour_attention.py`; the C columns after
-# those 3 C of `pixels` and `slope` are $z + b$ and $W$, which make the token itself.
-#
-# **Predict:** is this an approximation?
+# The arguments are those of the library's own `_attend_kernel`, in `kernels/neighbour_attention.py`; the C columns
+# after those 3 C of `pixels` and `slope` are $z + b$ and $W$, which make the token itself, and 13 more only fill a row
+# up. (In code, `W` contains the scale of offsets.)
 
 # %%
 network = models.load("iln").to(device)  # trained, D = 1
@@ -453,7 +460,7 @@ W, b = decoder.position.weight * OFFSET_SCALE, decoder.position.bias
 gamma, beta, M = block.norm.weight, block.norm.bias, block.qkv.weight
 
 with torch.no_grad():
-    features = network.encode(image[None], True).features  # (1, C, H, W)
+    features = network.encode(image[None], wrap=True).features  # (1, C, H, W)
     z, offsets = (part[0] for part in gather_neighbours(features, queries[None]))  # (Q, 4, C), (Q, 4, 2)
     token_by_token = block.qkv(block.norm(z + offsets @ W.T + b))
 
@@ -464,8 +471,8 @@ with torch.no_grad():
     table = torch.cat((A, moments), -1).T.reshape(1, -1, *image.shape)  # an image of 3 C + 3 channels
 
     row = gather_neighbours(table, queries[None])[0][0]  # per token: gather, and two numbers of offset
-    squares = row[..., -3] + 2 * (offsets * row[..., -2:]).sum(-1) + (offsets @ N * offsets).sum(-1)
-    sigma = (squares / 64 + block.norm.eps).sqrt()
+    c_var = row[..., -3] + 2 * (offsets * row[..., -2:]).sum(-1) + (offsets @ N * offsets).sum(-1)  # C var(x)
+    sigma = (c_var / 64 + block.norm.eps).sqrt()
     hoisted = (row[..., :-3] + offsets @ B.T) / sigma[..., None] + c
 
 relative = (hoisted - token_by_token).abs().max() / token_by_token.abs().max()
@@ -481,17 +488,19 @@ with torch.no_grad():
     projected = project_pixels(features, (W, b), (gamma, beta), M, heads=8)
     step = neighbour_attention(projected, queries[None], (block.out.weight, block.out.bias))[0]
     x = z + offsets @ W.T + b
-    plain = x + block.out(attend_by_einsum(block.qkv(block.norm(x))))
+    plain = x + block.out(attend_neighbours(block.qkv(block.norm(x)), heads=8))
 print(f"whole attention step: largest difference {(step - plain).abs().max() / plain.abs().max():.1e}, relative")
 assert (step - plain).abs().max() < 1e-4 * plain.abs().max()
 
 # %% [markdown]
 # ### Exercise 2 · Variance by moments
-# ★★☆ · 10 minutes
 #
-# Write the quadratic yourself. `moments(z, W, b)`: from features `z` (P, C), `W` (C, 2) and `b` (C,) return
-# `squares` (P,), `u` (P, 2) and `gram` (2, 2). `variance(squares, u, gram, q, channels)`: for offsets `q` (P, 2) return
-# (P,), the variance of $z + Wq + b$ over the channels (divided by C, not C - 1) without ever forming a token.
+# ★☆☆ · 10 minutes
+#
+# Write the quadratic yourself. `moments(z, W, b)`: from features `z` (P, C), `W` (C, 2) and `b` (C,) return `squares`
+# (P,), which is $\hat z^\top \hat z$, `u` (P, 2), and `gram` (2, 2), which is $N$. `variance(squares, u, gram, offsets,
+# channels)`: for `offsets` (P, 2) return (P,), the variance of $z + W\delta + b$ over the channels (divided by C, not C
+# - 1), without ever forming a token.
 #
 # <details><summary>Hint: means over what?</summary>
 #
@@ -505,7 +514,7 @@ def moments(z, W, b):
     raise NotImplementedError
 
 
-def variance(squares, u, gram, q, channels):
+def variance(squares, u, gram, offsets, channels):
     raise NotImplementedError
 
 
@@ -516,8 +525,8 @@ def moments(z, W, b):
     return (z_hat**2).sum(-1), z_hat @ W_hat, W_hat.T @ W_hat
 
 
-def variance(squares, u, gram, q, channels):
-    return (squares + 2 * (q * u).sum(-1) + ((q @ gram) * q).sum(-1)) / channels
+def variance(squares, u, gram, offsets, channels):
+    return (squares + 2 * (offsets * u).sum(-1) + ((offsets @ gram) * offsets).sum(-1)) / channels
 
 
 # %% tags=["check"]
@@ -533,17 +542,23 @@ def _():
     )
 
     def both(z, q):
-        return variance(*moments(z, W, b), q, 16), (z + q @ W.T + b).var(-1, correction=0)
+        mine, true = variance(*moments(z, W, b), q, 16), (z + q @ W.T + b).var(-1, correction=0)
+        assert mine.shape == true.shape, f"one variance for each token: {tuple(true.shape)}, not {tuple(mine.shape)}"
+        return mine, true
 
     mine, true = both(z, torch.zeros_like(q))
     assert not torch.allclose(mine * 15 / 16, true), "divide by C, not by C - 1"
-    assert torch.allclose(mine, true), "zero offset: the variance of z + b. Is the mean over channels gone?"
+    assert torch.allclose(mine, true), (
+        "zero offset: the variance of z + b. Is b in it, is its mean over channels gone, is it divided by C?"
+    )
     mine, true = both(torch.full_like(z, 3.0) - b, q)
     assert torch.allclose(mine, true), (
         "z + b is the same in all channels: what is left is q N q / C. Has W lost its mean?"
     )
     mine, true = both(z, q)
-    assert torch.allclose(mine, true), f"offset {q[0].tolist()}: {mine[0]:.4f}, it should be {true[0]:.4f}"
+    assert torch.allclose(mine, true), (
+        f"offset {q[0].tolist()}: {mine[0]:.4f}, it should be {true[0]:.4f}. Is the mixed term there, twice?"
+    )
     assert torch.allclose(both(z, -3 * q)[0], both(z, -3 * q)[1]), "offsets are negative as well: 2 q u changes sign"
     assert variance(*moments(z[:0], W, b), q[:0], 16).shape == (0,), "no tokens: no variances"
 
@@ -568,8 +583,8 @@ def moments(z, W, b):
     return (z_hat**2).sum(-1), z_hat @ W_hat, W_hat.T @ W_hat
 
 
-def variance(squares, u, gram, q, channels):  # the mixed term once only
-    return (squares + (q * u).sum(-1) + ((q @ gram) * q).sum(-1)) / channels
+def variance(squares, u, gram, offsets, channels):  # the mixed term once only
+    return (squares + (offsets * u).sum(-1) + ((offsets @ gram) * offsets).sum(-1)) / channels
 
 
 # %% [markdown]
@@ -581,6 +596,7 @@ def variance(squares, u, gram, q, channels):  # the mixed term once only
 # of four pixels.
 #
 # ### Exercise 3 · Count it
+#
 # ★☆☆ · 7 minutes
 #
 # Write `multiply_adds(queries, pixels, depth, hoisted)` for the decoder with C = 64, for a whole frame. Token by token
@@ -615,8 +631,10 @@ def _():
         mine, true = multiply_adds(10, 1000, depth, False), 10 * count(depth)
         assert mine == true, f"token by token, D = {depth}, 10 queries: {true:,.0f} as PyTorch counts, not {mine:,.0f}"
     frame = multiply_adds(262144, 16384, 1, True)
-    assert frame == 262144 * (768 + 1536 + 51200) + 16384 * 12288, (
-        f"D = 1, 16 queries per pixel, hoisted: not {frame:,.0f}"
+    wanted = 262144 * (768 + 1536 + 51200) + 16384 * 12288
+    assert frame == wanted, (
+        f"D = 1, 16 queries per pixel, hoisted: {wanted:,}, you have {frame:,.0f}, {(frame - wanted) / 262144:,.0f} too "
+        "many per query"
     )
     assert multiply_adds(10, 1000, 0, True) == multiply_adds(10, 1000, 0, False), "D = 0 has no block to hoist from"
     saved = [multiply_adds(100, 50, depth, False) - multiply_adds(100, 50, depth, True) for depth in (1, 2)]
@@ -645,8 +663,8 @@ def multiply_adds(queries, pixels, depth, hoisted):  # forgets that D = 0 has no
 
 # %% [markdown]
 # Counting is one thing. Here is the clock for one attention step, from features to new tokens, three ways: token by
-# token; hoisted, in plain PyTorch as above; and `neighbour_attention`, hoisted and in one kernel. All make their table
-# anew for each image.
+# token; hoisted, in plain PyTorch as above; and `neighbour_attention`, hoisted and in one kernel. The first two use
+# `attend_neighbours` for the 4 × 4. All make their table anew for each image.
 #
 # **Predict:** does the hoisted version in plain PyTorch win, from which number of queries per pixel on?
 
@@ -658,7 +676,7 @@ features = torch.randn(1, 64, height, width, device=device).contiguous(memory_fo
 def by_tokens(queries):
     z, offsets = gather_neighbours(features, queries)
     x = z + offsets @ W.T + b
-    return x + block.out(attend_by_einsum(block.qkv(block.norm(x))[0]))
+    return x + block.out(attend_neighbours(block.qkv(block.norm(x)), heads=8))
 
 
 def by_hoisting(queries):
@@ -667,9 +685,9 @@ def by_hoisting(queries):
     parts = (z_hat * gamma) @ M.T, z_hat @ W_hat, (z_hat**2).sum(-1, keepdim=True), features.movedim(1, 3) + b
     rows, offsets = gather_neighbours(torch.cat(parts, -1).movedim(3, 1), queries)
     a, u, squares, x = rows.split([192, 2, 1, 64], -1)
-    squares = squares + 2 * (offsets * u).sum(-1, keepdim=True) + (offsets @ N * offsets).sum(-1, keepdim=True)
-    qkv = (a + offsets @ B.T) / (squares / 64 + block.norm.eps).sqrt() + c
-    return x + offsets @ W.T + block.out(attend_by_einsum(qkv[0]))
+    c_var = squares + 2 * (offsets * u).sum(-1, keepdim=True) + (offsets @ N * offsets).sum(-1, keepdim=True)
+    qkv = (a + offsets @ B.T) / (c_var / 64 + block.norm.eps).sqrt() + c
+    return x + offsets @ W.T + block.out(attend_neighbours(qkv, heads=8))
 
 
 def by_op(queries):
@@ -723,11 +741,11 @@ for name, values in clock.items():
 # Where this page was built hoisting alone gained nothing: it saves multiplications, but in plain PyTorch it pays for
 # them with memory, since each token gathers 259 numbers of its pixel instead of 64 and passes over them again and
 # again. That is what notebook 06 was about. In one kernel, where what is gathered stays in registers, both gains come
-# together.
+# together. At an eighth of a query per pixel, though, it is better not to hoist at all, as the count says.
 #
 # ## 5. Does attention help? Train and see
 #
-# The paper compares depths after days of training. We have a minute: three depths, the same 30 batches of rays in one
+# The paper compares depths after days of training. We have a minute: three depths, the same batches of rays in one
 # town, two starts (seeds) each, and one scan elsewhere in that town to test. Small encoders, 30 steps.
 #
 # **Predict:** which depth comes out ahead? And how far apart are two starts of the same depth?
@@ -738,7 +756,7 @@ SEEDS = 0, 1
 coarse, fine = preset("paper-16x1024"), preset("paper-64x1024")
 town = data.street("town01", device=device)
 rays = iter(data.ContinuousRays([town], coarse, crops=2, columns=48, queries=256, seed=0))
-batches = [next(rays) for _ in range(30)]
+batches = [next(rays) for _ in range(STEPS)]
 [(scan, truth)] = data.held_out_scans(town, 1, [coarse, fine])
 
 
@@ -747,8 +765,8 @@ def train(depth, seed):
     model = models.create("iln", depth=depth, blocks=2).to(device)
     optimiser = torch.optim.Adam(model.parameters(), lr=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 1e-3, total_steps=STEPS)
-    for step in range(STEPS):
-        image, queries, ranges, wrap = (x.to(device) if isinstance(x, torch.Tensor) else x for x in batches[step % 30])
+    for batch in batches:
+        image, queries, ranges, wrap = (x.to(device) if isinstance(x, torch.Tensor) else x for x in batch)
         loss = (model(image, queries, wrap) - ranges).abs().mean()
         optimiser.zero_grad()
         loss.backward()
@@ -779,14 +797,16 @@ print(f"IoU: depths differ by up to {max(by_depth) - min(by_depth):.3f}, two sta
 # %% [markdown]
 # Compare the last two numbers before you believe any order. If two starts of one depth lie about as far apart as the
 # depths do, this run tells nothing about depth. With so few steps that is what to expect, and a table with one number
-# per depth would not have shown it. Also compare with bilinear interpolation, which needs no training: after 30 steps a
+# per depth would not have shown it. (A depth's number is a mean of two starts, which scatters less than one start, by
+# $\sqrt 2$.) Also compare with bilinear interpolation, which needs no training: after 30 steps a
 # network has only begun. Set `FAST = False` for ten times the steps.
 #
 # ## 6. The weights at an edge
 #
-# What a long training makes of it: the shipped network (D = 1, notebook 08 says how it was trained) on a small world
-# with a formula for its ranges, so that the truth is known along any ray: a road, a wall 15 m ahead, a pillar before
-# it. A query moves along a row of pixels over the left edge of the pillar.
+# What a long training makes of it: the shipped network (D = 1; `ilnet/weights/README.md` says how it was trained) on a
+# small world with a formula for its ranges, so that the truth is known along any ray: a road, a wall 15 m ahead, a
+# pillar before it. A query moves along a row of pixels over the edge of the pillar at column 561. (Columns count to the
+# left: it is the pillar's right edge as you would see it.)
 #
 # **Predict:** draw the weights of the four neighbours while the query crosses the cell in which the edge lies: for
 # bilinear interpolation, and for a network that got it right.
@@ -807,7 +827,7 @@ def ranges_along(directions):
 
 
 scene = ranges_along(coarse.directions()).to(device)
-encoded = network.encode(scene[None], True).features
+encoded = network.encode(scene[None], wrap=True).features
 EDGE = 560  # column of the last pixel before the pillar
 
 
@@ -849,10 +869,11 @@ def draw_edge(row=9.5):
     for part, hatch in zip(shown, ("", "", "///", "\\\\\\"), strict=True):
         part.set(hatch=hatch, edgecolor="white", linewidth=0.3)
     jump = columns[1:][truth.diff().abs() > 1]
+    right.plot(columns, 1 - (columns - EDGE), "--", color="black", linewidth=1)  # bilinear: both on the left together
     for place in jump:
         right.axvline(place, color="black", linewidth=2, linestyle=":")
     right.set(xlabel="column of the query [pixels]", ylabel="weights, stacked", ylim=(0, 1), xlim=(EDGE, EDGE + 1))
-    right.set_title("weights in the cell of the edge (dotted: the edge)")
+    right.set_title("in the cell of the edge (dotted: the edge; dashed: bilinear)", fontsize=10)
     right.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
     plt.show()
 
@@ -872,32 +893,32 @@ assert on_left[0] > 0.9
 assert on_left[-1] < 0.1
 
 # %% [markdown]
-# *In words: left, ranges along a row. The truth falls from the wall's 15.8 m to the pillar's 8 m in one step; bilinear
-# interpolation draws a ramp over the whole cell; the network a steep step. Right, the four weights in that cell,
-# stacked and hatched: first the two left pixels have all of it, then, within a small part of the cell, the two right
-# ones take over.*
+# *In words: left, ranges along a row. The truth falls from the wall's 15.7 m to the pillar's 8.5 m in one step;
+# bilinear interpolation draws a ramp over the whole cell; the network a steep step. Right, the four weights in that
+# cell, stacked and hatched: first the two left pixels have all of it, then, within a small part of the cell, the two
+# right ones take over. A dashed line falls from 1 to 0: what bilinear interpolation gives to the two left ones.*
 #
 # Bilinear weights change evenly from one end of the cell to the other, and every query in between makes up a point in
 # the air between pillar and wall. The network's weights switch. *Where* they switch is a guess from what the
 # surroundings look like; the image does not tell where in the cell the edge lies. But on either side of it the answer
 # is a surface that is there.
 #
-# Move the row with the slider: at rows of pixels (9.0) and between them, and below row 8, where the road begins. (The
-# slider works where a kernel runs.)
+# Move the row with the slider: at rows of pixels (9.0) and between them, and below row 5, where the road hides the foot
+# of the wall. (The slider works where a kernel runs.)
 
 # %%
-_ = ipywidgets.interact(draw_edge, row=(6.0, 14.75, 0.25))
+_ = ipywidgets.interact(draw_edge, row=(2.0, 14.75, 0.25))
 
 # %% [markdown]
 # ## Summary
 #
 # 1. Four tokens, feature plus embedded offset, attend to each other in D blocks; a head scores each. At D = 0 a score
 #    cannot depend on the other neighbours.
-# 2. Multiply-adds count what large matrices cost. A 4 × 4 is another matter: one thread per query and head.
+# 2. Multiply-adds count what large matrices cost. A 4 × 4 needs a kernel: one thread per query and head.
 # 3. The layer norm's variance is quadratic in the offset, so $M$ can be applied per pixel, exactly. It pays from a
 #    quarter of a query per pixel on, if what it gathers is used at once.
-# 4. A difference between networks counts if it is larger than that between two starts of one network. Ours trained too
-#    short for a verdict on depth.
+# 4. A difference between networks counts if it is larger than that between two starts of one network. Ours were trained
+#    too briefly for a verdict on depth.
 #
 # ## Next
 #

@@ -80,6 +80,36 @@ def test_an_interrupted_run_goes_on_to_the_same_weights(tmp_path, quick, monkeyp
     assert {p.name for p in (tmp_path / "cut" / "iln-prior").iterdir()} == {"from-step-0", "from-step-4"}
 
 
+def test_a_run_cut_in_a_validation_makes_up_for_it(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(train, "CHECKPOINT_EVERY", 1)
+    monkeypatch.setattr(train, "VALIDATE_EVERY", (2, 2))
+    quick(tmp_path / "whole", steps=6)
+    with monkeypatch.context() as cut:
+        original = train.Training.validation_step
+
+        def validate_or_die(self, place, index):
+            if self.global_step == 4:
+                raise SystemError("power cut")
+            return original(self, place, index)
+
+        cut.setattr(train.Training, "validation_step", validate_or_die)
+        with pytest.raises(SystemError):
+            quick(tmp_path / "cut", steps=6)
+    quick(tmp_path / "cut", steps=6)
+
+    def validated(run):
+        found = []
+        for log in sorted((tmp_path / run / "iln-prior").glob("from-step-*/metrics.csv")):
+            with open(log, newline="") as file:
+                found += [(row["step"], row["val/iou"]) for row in csv.DictReader(file) if row["val/iou"]]
+        return found
+
+    assert [step for step, _ in validated("whole")] == ["1", "3", "5"]
+    assert validated("cut") == validated("whole")
+    whole, cut = (models.load(tmp_path / run / "iln-prior.safetensors").state_dict() for run in ("whole", "cut"))
+    assert all(torch.equal(whole[key], cut[key]) for key in whole)
+
+
 def test_the_figures_are_those_of_the_final_weights(tmp_path, quick, monkeypatch):
     monkeypatch.setattr(train, "VALIDATE_EVERY", (3, 3))
     figures = quick(tmp_path, steps=5)
