@@ -168,10 +168,14 @@ def convergence(study: Study) -> None:
             steps = sorted(set.intersection(*(set(run) for run in runs)))
             values = np.array([[run[step][y] for step in steps] for run in runs])
             at = np.mean([[run[step][x] for step in steps] for run in runs], axis=0)
-            axis.plot(at, values.mean(0), color=_COLOURS[name], label=name)
-            axis.fill_between(at, values.min(0), values.max(0), color=_COLOURS[name], alpha=0.25)
-        axis.set_xlabel(x)
+            at = at / 60 if x == "seconds" else at
+            axis.plot(at, values.mean(0), {"liif": "--", "iln": "-"}[name], color=_COLOURS[name], label=name)
+            axis.fill_between(at, values.min(0), values.max(0), color=_COLOURS[name], alpha=0.25, linewidth=0)
+        axis.set_xlabel({"step": "step", "seconds": "minutes"}[x])
         axis.set_ylabel({"iou": "IoU", "mae": "MAE [m]"}[y])
+    axis.set_yscale("log")
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter("{x:g}")
     axis.legend()
     figure.savefig(study.out / "convergence.png", dpi=120)
 

@@ -28,7 +28,7 @@
 # | | |
 # |---|---|
 # | You know | Python, a little PyTorch (tensors, shapes, indexing) |
-# | Time | 30 minutes to work through; under a minute to run |
+# | Time | 15 minutes, and 15 for the exercises; under a minute to run |
 # | Hardware | any computer; a CUDA GPU is used if there is one |
 #
 # How to use the course: read, run each cell (Shift + Enter), and when a line says **Predict:**, write down what you

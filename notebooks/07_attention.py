@@ -844,8 +844,8 @@ def along_row(row, columns):
 
 
 # %%
-COLOURS = "#d55e00", "#0072b2", "#e69f00", "#56b4e9"
-NAMES = "row-, col-", "row-, col+", "row+, col-", "row+, col+"
+COLOURS = "#d55e00", "#e69f00", "#0072b2", "#56b4e9"
+NAMES = "row-, col-", "row+, col-", "row-, col+", "row+, col+"
 
 
 def draw_edge(row=9.5):
@@ -865,8 +865,8 @@ def draw_edge(row=9.5):
 
     columns = torch.linspace(EDGE, EDGE + 0.999, 200)
     weights, _, truth = along_row(row, columns)
-    shown = right.stackplot(columns, weights.T, colors=COLOURS, labels=NAMES)
-    for part, hatch in zip(shown, ("", "", "///", "\\\\\\"), strict=True):
+    shown = right.stackplot(columns, weights.T[[0, 2, 1, 3]], colors=COLOURS, labels=NAMES)  # the left two below
+    for part, hatch in zip(shown, ("", "///", "", "\\\\\\"), strict=True):
         part.set(hatch=hatch, edgecolor="white", linewidth=0.3)
     jump = columns[1:][truth.diff().abs() > 1]
     right.plot(columns, 1 - (columns - EDGE), "--", color="black", linewidth=1)  # bilinear: both on the left together
@@ -893,10 +893,11 @@ assert on_left[0] > 0.9
 assert on_left[-1] < 0.1
 
 # %% [markdown]
-# *In words: left, ranges along a row. The truth falls from the wall's 15.7 m to the pillar's 8.5 m in one step;
-# bilinear interpolation draws a ramp over the whole cell; the network a steep step. Right, the four weights in that
-# cell, stacked and hatched: first the two left pixels have all of it, then, within a small part of the cell, the two
-# right ones take over. A dashed line falls from 1 to 0: what bilinear interpolation gives to the two left ones.*
+# *In words: left, ranges along a row. The truth falls from the wall's 15.7 m to the pillar's 8.5 m in one step; bilinear
+# interpolation draws a ramp over the whole cell; the network a steep step. Right, the four weights in that cell,
+# stacked and hatched, those of the two left pixels below: first these have all of it, then, within a small part of the
+# cell, the two right ones take over. A dashed line falls from 1 to 0: what bilinear interpolation gives to the two left
+# ones.*
 #
 # Bilinear weights change evenly from one end of the cell to the other, and every query in between makes up a point in
 # the air between pillar and wall. The network's weights switch. *Where* they switch is a guess from what the
