@@ -343,7 +343,7 @@ def results(study: Study) -> Path:
     for name, rows in done.items():
         lines += ["", f"## {name}", "", (EXPERIMENTS[name].__doc__ or "").strip(), ""]
         lines += [f"Made with {about[name]['networks']}.", "", f"![{name}]({name}.png)", ""]
-        lines += _markdown(_beside_the_paper(rows) if name == "table" else rows) if name != "convergence" else []
+        lines += _markdown(_shown(name, rows))
         if name == "table":
             lines += ["", *(f"![The same crop by every method, {town}](points-{town}.png)" for town in towns.TEST)]
     page = study.out / "RESULTS.md"
@@ -392,6 +392,14 @@ def _about(folder: Path) -> dict[str, Any]:
 def _read(file: Path) -> list[dict[str, Any]]:
     with open(file, newline="") as text:
         return list(csv.DictReader(text))
+
+
+def _shown(name: str, rows: Sequence[dict[str, Any]]) -> Sequence[dict[str, Any]]:
+    """The rows that the page shows of an experiment: of a convergence where it ends."""
+    if name == "convergence":
+        last = max(int(row["step"]) for row in rows)
+        return [row for row in rows if int(row["step"]) == last]
+    return _beside_the_paper(rows) if name == "table" else rows
 
 
 def _beside_the_paper(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:

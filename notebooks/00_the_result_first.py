@@ -98,9 +98,9 @@ figure.colorbar(shown, ax=list(axes), label="range [m]", fraction=0.02, pad=0.01
 plt.show()
 
 # %% [markdown]
-# *In words: four range images, 120 degrees of each; near is yellow-green, far is dark blue, no return white. The
+# *In words: four range images, 120 degrees of each; near is yellow-green, far is dark purple, no return white. The
 # measured one is made of 16 broad stripes. In the bilinear one, things have blurred outlines, green where yellow meets
-# blue. In the network's, outlines are sharp though a little ragged. The truth has thin poles, leaves and the outlines
+# purple. In the network's, outlines are sharp though a little ragged. The truth has thin poles, leaves and the outlines
 # that cars really have.*
 #
 # ## 3. Where it smears
@@ -159,7 +159,8 @@ show_scene(plotter)
 # Three figures tell it. **MAE** is the mean absolute error over all pixels, where no return counts as 100 m: a pixel
 # that has a return and should not, or the other way round, costs tens of metres. **IoU** is the number of 10 cm cubes
 # that hold points of both clouds, divided by the number of those that hold points of either: 1 is perfect. **Floating**
-# is the share of points in empty space between two surfaces. (`upsample` returns a `Scan`, `ranges` only its tensor.)
+# is the share of points in empty space between two surfaces. (A model's `upsample` returns a `Scan`; its method
+# `ranges` returns the plain numbers, in which no return is still close to 100 m and not yet 0.)
 
 # %%
 found = {}

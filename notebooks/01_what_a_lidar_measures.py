@@ -269,7 +269,7 @@ figure.colorbar(shown, ax=(above, below), label="range [m]", fraction=0.03, pad=
 plt.show()
 
 # %% [markdown]
-# *In words: the same range image twice, near is yellow-green, far is dark blue, no return is white. Above, as it is
+# *In words: the same range image twice, near is yellow-green, far is dark purple, no return is white. Above, as it is
 # stored, the road is at the top and the sky at the bottom, and left and right are exchanged. Below, flipped both ways,
 # a road in even stripes with house fronts, trees and cars above it.*
 #
@@ -447,8 +447,8 @@ print(
 # 1023 and column 0 lie the columns from 1023 to just below 1024, and 1024 is 0 again. `sensor.wrap` says whether there
 # is a seam at all: a sensor that sees only half the circle has two ends.
 #
-# What happens to who forgets it? We turn the sensor so that its seam runs through a parked car, take an image of 64
-# rows and 64 columns, and make it 64 times finer in azimuth by linear interpolation along each row. Once with
+# What happens to code that forgets it? We turn the sensor so that its seam runs through a parked car, take an image of
+# 64 rows and 64 columns, and make it 64 times finer in azimuth by linear interpolation along each row. Once with
 # `np.interp` on the table of azimuths as it stands, once with column 0 repeated behind column 63. The town knows the
 # truth.
 #
@@ -881,8 +881,8 @@ plt.show()
 # ## 8. Scans in files
 #
 # A range image alone is not a scan: the tables of angles have to come along. An `.npz` file of this project holds both.
-# Point files (`.ply`, `.pcd`, KITTI's `.bin`) do not know their sensor, so that reading one needs it, and sorts the
-# points into its image as you did.
+# Point files (`.ply`, `.pcd`, KITTI's `.bin`) do not know their sensor, so that you have to name it (a `.bin` is else
+# taken for `hdl-64e`); reading sorts the points into its image as you did.
 
 # %%
 with tempfile.TemporaryDirectory() as folder:

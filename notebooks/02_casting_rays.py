@@ -329,8 +329,8 @@ def plane_range(origin: wp.vec3, direction: wp.vec3, normal: wp.vec3, offset: fl
 # $$|\mathbf v + r\,\mathbf d|^2 = R^2 \quad\Longleftrightarrow\quad r^2 + 2\,b\,r + c = 0 \quad\text{with}\quad
 # b = \mathbf v \cdot \mathbf d, \quad c = \mathbf v \cdot \mathbf v - R^2,$$
 #
-# since $\mathbf d \cdot \mathbf d = 1$. Such an equation has two solutions, $-b - \sqrt q$ and $-b + \sqrt q$ with
-# $q = b^2 - c$, one where $q = 0$, and none where $q < 0$.
+# since $\mathbf d \cdot \mathbf d = 1$. (Plain $c$ is a number, bold $\mathbf c$ the centre.) Such an equation has two
+# solutions, $-b - \sqrt q$ and $-b + \sqrt q$ with $q = b^2 - c$, one where $q = 0$, and none where $q < 0$.
 
 # %%
 cases = {  # where the ray starts (it runs to the right), and its name
@@ -801,7 +801,8 @@ draw_thread(
 #
 # A test with known answers: a cube of 2 m around the sensor, two triangles a side, and the six rays along the axes.
 # Axis-aligned rays deserve a test of their own. They hit the very diagonal that the two triangles of a side share
-# ($u + v = 1$ or $v = 0$), and two of their components are 0, by which the boxes of the next section divide.
+# ($u + v = 1$ for one of them, $u = 0$ for the other), and two of their components are 0, by which the boxes of the
+# next section divide.
 #
 # **Predict:** what would happen to these rays if the test said `u <= 0.0 or v <= 0.0 or u + v >= 1.0`?
 
@@ -921,9 +922,9 @@ assert len(opened) < len(boxes) / 4
 #
 # Warp has this tree. `wp.Bvh` builds it over boxes that we give it, one around each triangle. In a kernel
 # `wp.bvh_query_ray` starts a walk, and each `wp.bvh_query_next` finds the next triangle whose box the ray meets. It
-# takes a distance beyond which boxes need not be opened: once something is hit, all that is farther away. A kernel is
-# handed the tree's `id`, a number by which it finds the tree (`wp.uint64`, an integer of 64 bits); the Python object
-# has to live as long.
+# takes a distance beyond which boxes need not be opened; once something is hit, that is the range of the hit. A kernel
+# is handed the tree's `id`, a number by which it finds the tree (`wp.uint64`, an integer of 64 bits); the Python object
+# has to live as long as the id is used.
 #
 # **Predict:** how many of the million triangles does a ray still test on average?
 
@@ -1018,7 +1019,7 @@ run(cast_mesh_kernel, len(rays), [mesh.id, wp.vec3(), rays, sensor.max_range], [
 
 differ = ((mine - by_tree).abs() > 1e-3).sum()
 print(f"{differ} of {len(rays):,} rays differ from our own walk by more than a millimetre")
-assert differ < 20  # rays that graze an edge
+assert differ < 20
 
 draw_thread(
     "cast_mesh_kernel: one thread per ray, here 2",
@@ -1085,8 +1086,8 @@ assert abs(road - sine) < 0.03
 
 # %% [markdown]
 # *In words: above, the range image of the street, road below, house fronts, trees and cars above it, no return white.
-# Below, the cosines: the road is dark blue, nearly 0; house fronts are yellow where a ray meets them at right angles
-# and darken towards their ends; trees and cars are a mixture.*
+# Below, the cosines: the road is dark blue, below 0.3 and nearly 0 far away; house fronts are yellow where a ray meets
+# them at right angles and darken towards their ends; trees and cars are a mixture.*
 #
 # On a level road the cosine is the sine of the angle below the horizon: 0.12 at 7°. Two neighbouring beams touch such a
 # surface eight times as far apart as on a wall that faces us. Grazing rays are also those that a real sensor gets no

@@ -198,16 +198,16 @@ def bilinear_areas(queries):
 # The last line takes a moment: $w_t \propto a_t / r_t$, so $\hat r = \sum (a_t/r_t)\,r_t \big/ \sum (a_t/r_t)$, and the
 # numerator is $\sum a_t = 1$.
 #
-# From the equation to the kernel that does it, `gather_blend_kernel` in `kernels/gather_blend.py`. (The op adds a batch
-# dimension B; `wp.Float` is any floating-point type.)
+# From the equation to the kernel that does it, `_gather_blend_kernel` in `kernels/gather_blend.py`. (The op adds a
+# batch dimension B; `wp.Float` is any floating-point type.)
 #
 # | equation | line of code | kernel argument |
 # |---|---|---|
 # | $r_t$ | `image` | `image: wp.array3d[wp.Float]`, (B, H, W) |
-# | where $t = 1..4$ are | `queries` | `queries: wp.array3d[wp.Float]`, (B, Q, 2) |
+# | where $t = 1..4$ are | `queries` | `queries: wp.array2d[...]`, two numbers at once |
 # | $s$ | `scores` | `scores: wp.array2d[...]`, four at once |
 # | $p$ | `prior="perspective"` | `prior: int` |
-# | $\hat r$ | `gather_blend(image, queries, scores, prior)` | `ranges_out` |
+# | $\hat r$ | `gather_blend(image, queries, scores, prior)` | `blended_out` |
 
 # %%
 draw_thread(
@@ -218,13 +218,13 @@ draw_thread(
         Cells("scores", (6, 4), [(2, 0), (2, 1), (2, 2), (2, 3)]),
     ],
     "locate 4 neighbours\n$w = $ softmax$(s + p)$\n$\\hat r = \\sum_t w_t\\, r_t$",
-    [Cells("ranges_out", (6, 1), [(2, 0)])],
+    [Cells("blended_out", (6, 1), [(2, 0)])],
 )
 
 # %% [markdown]
 # *In words: on the left three arrays; a thread reads two by two pixels of the image, one row of the queries, one row of
-# the scores. On the right it writes one element of the ranges. No other thread writes there, and nothing in between
-# goes through memory.*
+# the scores. On the right it writes one element of the answer (and, not drawn, its four weights). No other thread
+# writes there, and nothing in between goes through memory.*
 
 # %%
 zero = image.new_zeros(1, 4)
@@ -362,8 +362,8 @@ def inverse_blend(r, a):
 # agree, the two in the next column agree, and the two pairs lie as far apart as possible. We look at the image only,
 # not at the truth.
 #
-# **Predict:** a query moves from the left column to the right one. How does the truth change on the way? And the two
-# blends?
+# **Predict:** a query moves from one column to the next (from the left one to the right one, as the array is drawn).
+# How does the truth change on the way? And the two blends?
 
 # %%
 one, other = scan.ranges[:, :-1], scan.ranges[:, 1:]  # each column and the next

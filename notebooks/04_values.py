@@ -28,7 +28,7 @@
 # | | |
 # |---|---|
 # | You know | [03 · Between the pixels](03_between_the_pixels.ipynb); what a loss and an optimiser are |
-# | Time | 30 minutes, and 20 for the exercises; about a minute to run |
+# | Time | 30 minutes, and 25 for the exercises; about a minute to run |
 # | Hardware | any computer; a CUDA GPU is used if there is one |
 
 # %%
@@ -63,27 +63,27 @@ device = "cuda" if torch.cuda.is_available() else "cpu"
 #
 # | equation | line of code | kernel argument |
 # |---|---|---|
-# | $\mathbf z_t,\ \Delta\mathbf q_t$ | `z, offsets = gather_neighbours(features, queries)` | `features: (B, C, H, W)`, `z_out`, `offsets_out` |
+# | $\mathbf z_t,\ \Delta\mathbf q_t$ | `z, offsets = gather_neighbours(features, queries)` | `features`, `gathered_out`, `offsets_out` |
 # | $h(\mathbf z_t, \Delta\mathbf q_t)$ | `values = self.h(torch.cat((z, offsets), -1))` | (matrix products, left to torch) |
-# | $\sum_t \frac{S_t}{S}\,(\cdot)$ | `area_blend(values, queries)` | `values: (B, Q)` of 4-vectors, `ranges_out` |
+# | $\sum_t \frac{S_t}{S}\,(\cdot)$ | `area_blend(values, queries)` | `values`, one vector of 4 per query, `blended_out` |
 
 # %%
 draw_thread(
-    "gather_neighbours: one thread, one query",
+    "gather_neighbours: what is read and written for one query",
     [
         Cells("features", (5, 9), [(2, 4), (2, 5), (3, 4), (3, 5)]),
         Cells("queries", (6, 2), [(2, 0), (2, 1)]),
     ],
     "locate 4 neighbours\ncopy 64 channels of each\nsubtract coordinates",
     [
-        Cells("z_out (each 64 channels)", (6, 4), [(2, 0), (2, 1), (2, 2), (2, 3)]),
+        Cells("gathered_out (each 64 channels)", (6, 4), [(2, 0), (2, 1), (2, 2), (2, 3)]),
         Cells("offsets_out (each 2)", (6, 4), [(2, 0), (2, 1), (2, 2), (2, 3)]),
     ],
 )
 
 # %% [markdown]
-# *In words: a thread reads its query and the features of two by two pixels, and writes one row of four feature vectors
-# and one row of four offsets.*
+# *In words: for one query the features of two by two pixels are read (in the library by four threads, one for each
+# neighbour), and one row of four feature vectors and one row of four offsets are written.*
 #
 # ### Exercise 1 · Equation 2
 #
@@ -284,7 +284,7 @@ if FAST:
     assert curve[STEPS]["iou"] < untrained["iou"]
 
 # %% [markdown]
-# In IoU the trained network is far behind a formula without any training. (How far, depends on the seed: with other
+# In IoU the trained network is far behind a formula without any training. (How far depends on the seed: with other
 # seeds we got from 0.01 to 0.09. Rely on no more than *near zero*.) Why?
 #
 # ## 4. What it does to a wall
@@ -404,9 +404,10 @@ axis.legend(frameon=False)
 plt.show()
 
 # %% [markdown]
-# *In words: range over four columns. Black triangles, the measured pixels, lie on two levels; the truth, a thin black
-# line, jumps from one to the other between two columns. Bilinear interpolation (dashed) draws a slope between these two
-# columns. LIIF (solid) climbs slowly across all four, and misses the measured levels on both sides.*
+# *In words: range over four columns. Black triangles, the measured pixels, lie at 5.5 m before the edge and at 16 and
+# 18 m behind it; the truth, a thin black line, jumps up between two columns, and a little more just behind. Bilinear
+# interpolation (dashed) draws slopes between the columns. LIIF (solid) climbs slowly across all four, and misses the
+# measured levels on both sides.*
 #
 # A continuous function of the offset cannot jump; to come near a jump, $h$ has to learn very steep slopes. So LIIF
 # makes flying points like the formula it was to replace, and is off beside the edge as well.

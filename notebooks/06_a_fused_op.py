@@ -29,10 +29,10 @@
 # | | |
 # |---|---|
 # | You know | queries and neighbours (03), weights by softmax (05), a first kernel (02); PyTorch's `backward()` |
-# | Time | 45 minutes, and 40 for the exercises, with a good place to pause behind section 4; under a minute to run |
+# | Time | 45 minutes, and 40 for the exercises, with a good place to pause after section 4; under a minute to run |
 # | Hardware | any computer; a CUDA GPU is used if there is one |
 #
-# Each section asks you for a prediction. Write it down before you run the next cell.
+# Nearly every section asks you for a prediction. Write it down before you run the next cell.
 
 # %%
 import time
@@ -484,7 +484,8 @@ assert torch.allclose(ours, leaf.grad, atol=1e-4)
 #
 # Derive $\partial h / \partial s_t$ and $\partial h / \partial r_t$ on paper. Then write `harmonic_backward`: from
 # ranges `r` (Q, 4), `scores` (Q, 4) and `adj` (Q,), the gradient that arrives at `h`, return the gradients `adj_r` and
-# `adj_s`, both (Q, 4), in closed form (PyTorch, no autograd). You may express them by $h$.
+# `adj_s`, both (Q, 4), in closed form (PyTorch, no autograd). You may express them by $h$ (a range here, not the MLP of
+# notebooks 04 and 05).
 #
 # <details><summary>Hint: the chain</summary>
 #
@@ -606,8 +607,9 @@ print(f"terms per pixel: {demand.float().mean():.0f} on average, at most {demand
 assert demand.float().mean() == 64
 
 # %% [markdown]
-# *In words: five by five pixels drawn as squares, between them the queries as dots, eight rows and two columns of them
-# to a cell. The queries of the four cells around the middle pixel are marked by crosses: all of them add to it.*
+# *In words: five by five pixels drawn as squares, between them the queries as dots, eight or nine rows and two columns
+# of them to a cell. The queries of the four cells around the middle pixel are marked by crosses: all of them add to
+# it.*
 #
 # To add, a thread reads the old sum, adds its term, and writes the new sum. If two threads read before either writes,
 # one term is lost: a *race*. Here is one in slow motion. PyTorch's `total[index] += term` first reads all, then adds,
@@ -793,8 +795,8 @@ def sum_by_pixel(values, pixels, count):  # only pixels that somebody asks for
 # %% [markdown]
 # ## 5. A PyTorch op
 #
-# A `torch.autograd.Function` ties forward and backward together. It returns one gradient for each argument of
-# `forward`, `None` for the queries, which carry none. What backward needs goes through `ctx.save_for_backward`.
+# A `torch.autograd.Function` ties forward and backward together. Its `backward` returns one gradient for each argument
+# of `forward`, `None` for the queries, which need none. What backward needs goes through `ctx.save_for_backward`.
 #
 # Our kernels write only into tensors that we made, never into PyTorch's own gradients: these are added up elsewhere.
 
@@ -1086,11 +1088,13 @@ plt.show()
 # *In words: two bar charts with a pair of bars for each of the three ways. Left, bytes counted: PyTorch's steps have by
 # far the longest bars. Right, milliseconds measured on the computer that built this page.*
 #
-# (These outputs are from two cores of a CPU.) Forward, bytes foretell who wins, though not by how much: what was just
-# written is often still in a cache. Backward, our two kernels move half the bytes of PyTorch's steps and take *longer*:
-# they run on one core where PyTorch takes both, and each of the two computes the softmax anew. `gather_blend` shows
-# what is left in it. `torch.compile` fuses such chains by itself where it finds a compiler, and is then nearly as fast
-# forward: the README has both in one table. What it cannot do is change the algorithm, which the next notebook does.
+# (These outputs are from two cores of a CPU.) Forward, bytes foretell that kernels beat steps, though not by how much:
+# what was just written is often still in a cache. They do not tell the kernels apart: `gather_blend` moves 60 bytes to
+# our 44, and is faster since it takes both cores and vector instructions. Backward, our two kernels move half the bytes
+# of PyTorch's steps and take *longer*: they run on one core where PyTorch takes both, and each of the two computes the
+# softmax anew. `gather_blend` shows what is left in it. `torch.compile` fuses such chains by itself where it finds a
+# compiler, and is then nearly as fast forward: the README has both in one table. What it cannot do is change the
+# algorithm, which the next notebook does.
 
 # %% [markdown]
 # ## Summary

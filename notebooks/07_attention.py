@@ -13,8 +13,9 @@
 # %% [markdown]
 # # 07 · Attention among four neighbours
 #
-# ![Left, ranges along a row across the edge of a pillar, by three methods. Right, the weights of the four neighbours
-# while the query crosses the cell of that edge, as stacked bands](pictures/07_attention.png)
+# ![Left, ranges along a row across the edge of a pillar: the truth, bilinear interpolation and a network. Right, the
+# weights of the four neighbours while the query crosses the cell of that edge, as stacked
+# bands](pictures/07_attention.png)
 #
 # **Goal.** You build the network that says the scores, see what attention can add to it, and cut its work to half
 # without changing what it computes.
@@ -32,7 +33,7 @@
 # | Time | 40 minutes, and 25 for the exercises; one to two minutes to run |
 # | Hardware | any computer; a CUDA GPU is used if there is one |
 #
-# Each section asks you for a prediction. Write it down before you run the next cell.
+# Each section but the first asks you for a prediction. Write it down before you run the next cell.
 
 # %%
 import math
@@ -64,7 +65,7 @@ device = "cuda" if torch.cuda.is_available() else "cpu"
 # a *token*: its feature, plus where the query lies as seen from it, the offset $\delta_t$ in pixels (notebook 04's
 # $\Delta\mathbf q_t$), brought to 64 numbers by a linear layer (the *position embedding*):
 #
-# $$x_t = z_t + W \delta_t + b, \qquad t = 1 \ldots 4$$
+# $$x_t = z_t + W \delta_t + b, \qquad t = 0 \ldots 3$$
 #
 # D *blocks* follow, each made of two steps which add to the tokens what they found:
 #
@@ -78,7 +79,7 @@ device = "cuda" if torch.cuda.is_available() else "cpu"
 #   \operatorname{attend}_i = \sum_j P_{ij}\,\mathbf v_j$$
 #
 # (Two things are called query here: the direction that is asked of the network, and $\mathbf q_i$, which a token asks
-# of the other tokens. Both words are usual.) At last a linear layer scores each token (`head` in the code, which has
+# of the other tokens. Both uses are common.) At last a linear layer scores each token (`head` in the code, which has
 # nothing to do with the 8 heads), and the softmax of the four scores weighs the ranges, as in notebook 05. All of it
 # fits one screen:
 
@@ -365,8 +366,8 @@ draw_thread(
 
 # %% [markdown]
 # *In words: on the left the twelve rows of one query: query, key and value of each of four neighbours. The thread reads
-# the columns of its own head from all of them, and writes the same columns of four rows on the right. Its neighbours do
-# the other heads.*
+# the columns of its own head from all of them, and writes the same columns of four rows on the right. The threads
+# beside it do the other heads.*
 #
 # **Predict:** which takes longer, $M$ or the 4 × 4? Does it matter with what the 4 × 4 is computed?
 
@@ -434,23 +435,25 @@ for name, way in ways.items():
 #   + 2\, \delta^\top \underbrace{\hat W^\top \mathbf{\hat z}}_{u:\ \text{2 numbers}}
 #   + \delta^\top \underbrace{\hat W^\top \hat W}_{N:\ 2 \times 2} \delta$$
 #
-# a quadratic in the offset, with three numbers that belong to the pixel and a matrix that belongs to the network. And
+# a quadratic in the offset, with three numbers that belong to the pixel and a matrix that belongs to the network. And,
+# with $\sigma = \sqrt{\operatorname{var}(x) + \varepsilon}$,
 #
 # $$M\,\mathrm{LN}(x) = \frac{A + B \delta}{\sigma} + c, \qquad
 #   A = M \gamma \mathbf{\hat z}, \quad B = M \gamma \hat W, \quad c = M \beta$$
 #
 # where $\gamma$ multiplies channel by channel. It is exact.
 #
-# | equation | line of code | kernel argument |
+# | equation | line of code | field of `Projected` |
 # |---|---|---|
 # | $A$, per pixel | `(z_hat * gamma) @ M.T` | `pixels` (P, 4 C + 16), first 3 C columns |
 # | $\hat z^\top \hat z,\ u$, per pixel | `(z_hat**2).sum(-1)`, `z_hat @ W_hat` | `pixels`, columns 4 C to 4 C + 2 |
 # | $B$ | `(M * gamma) @ W_hat` | `slope` (2, 4 C), first 3 C columns |
 # | $c$, $N$ | `M @ beta`, `W_hat.T @ W_hat` | `shift` (3 C,), `gram` (2, 2) |
 #
-# The arguments are those of the library's own `_attend_kernel`, in `kernels/neighbour_attention.py`; the C columns
-# after those 3 C of `pixels` and `slope` are $z + b$ and $W$, which make the token itself, and 13 more only fill a row
-# up. (In code, `W` contains the scale of offsets.)
+# The names are those of what `project_pixels` returns (`kernels/neighbour_attention.py`; its own `_attend_kernel` gets
+# the columns from 4 C on as an argument of their own, `moments`); the C columns after those 3 C of `pixels` and `slope`
+# are $z + b$ and $W$, which make the token itself, and 13 more only fill a row up. (In code, `W` contains the scale of
+# offsets.)
 
 # %%
 network = models.load("iln").to(device)  # trained, D = 1
@@ -664,7 +667,7 @@ def multiply_adds(queries, pixels, depth, hoisted):  # forgets that D = 0 has no
 # %% [markdown]
 # Counting is one thing. Here is the clock for one attention step, from features to new tokens, three ways: token by
 # token; hoisted, in plain PyTorch as above; and `neighbour_attention`, hoisted and in one kernel. The first two use
-# `attend_neighbours` for the 4 × 4. All make their table anew for each image.
+# `attend_neighbours` for the 4 × 4. The two hoisted ones make their table anew in each run, too.
 #
 # **Predict:** does the hoisted version in plain PyTorch win, from which number of queries per pixel on?
 
@@ -805,8 +808,8 @@ print(f"IoU: depths differ by up to {max(by_depth) - min(by_depth):.3f}, two sta
 #
 # What a long training makes of it: the shipped network (D = 1; `ilnet/weights/README.md` says how it was trained) on a
 # small world with a formula for its ranges, so that the truth is known along any ray: a road, a wall 15 m ahead, a
-# pillar before it. A query moves along a row of pixels over the edge of the pillar at column 561. (Columns count to the
-# left: it is the pillar's right edge as you would see it.)
+# pillar before it. A query moves half way between two rows of pixels, over the edge of the pillar just before column
+# 561. (Columns count to the left: it is the pillar's right edge as you would see it.)
 #
 # **Predict:** draw the weights of the four neighbours while the query crosses the cell in which the edge lies: for
 # bilinear interpolation, and for a network that got it right.
@@ -893,19 +896,19 @@ assert on_left[0] > 0.9
 assert on_left[-1] < 0.1
 
 # %% [markdown]
-# *In words: left, ranges along a row. The truth falls from the wall's 15.7 m to the pillar's 8.5 m in one step; bilinear
-# interpolation draws a ramp over the whole cell; the network a steep step. Right, the four weights in that cell,
-# stacked and hatched, those of the two left pixels below: first these have all of it, then, within a small part of the
-# cell, the two right ones take over. A dashed line falls from 1 to 0: what bilinear interpolation gives to the two left
-# ones.*
+# *In words: left, ranges along row 9.5. The truth falls from the wall's 15.7 m to the pillar's 8.5 m in one step;
+# bilinear interpolation draws a ramp over the whole cell; the network a steep step. Right, the four weights in that
+# cell, stacked and hatched, those of the two left pixels below: first these have all of it, then, within a small part
+# of the cell, the two right ones take over. A dashed line falls from 1 to 0: what bilinear interpolation gives to the
+# two left ones.*
 #
 # Bilinear weights change evenly from one end of the cell to the other, and every query in between makes up a point in
 # the air between pillar and wall. The network's weights switch. *Where* they switch is a guess from what the
 # surroundings look like; the image does not tell where in the cell the edge lies. But on either side of it the answer
 # is a surface that is there.
 #
-# Move the row with the slider: at rows of pixels (9.0) and between them, and below row 5, where the road hides the foot
-# of the wall. (The slider works where a kernel runs.)
+# Move the row with the slider: at rows of pixels (9.0) and between them, and below row 5, where rays meet the road
+# before they reach the wall. (The slider works where a kernel runs.)
 
 # %%
 _ = ipywidgets.interact(draw_edge, row=(2.0, 14.75, 0.25))

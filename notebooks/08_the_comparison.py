@@ -456,9 +456,9 @@ plt.show()
 
 # %% [markdown]
 # *In words: two scatter plots of MAE against IoU, one for each size. Filled markers: the networks liif, iln and
-# iln-prior lie to the left, at the smallest errors; liif at the bottom, with an IoU below 0.3. The rules lie to the
-# right. Planes, a triangle, is the highest of all, at 64x1024 level with iln-prior. Hollow markers are the paper's
-# bilinear, liif and iln: all lower, iln above liif as here, but liif above bilinear.*
+# iln-prior lie to the left, at the smallest errors; liif the lowest of the three, with an IoU below 0.3. The rules lie
+# to the right. Planes, a triangle, is the highest of all, at 64x1024 level with iln-prior. Hollow markers are the
+# paper's bilinear, liif and iln: all lower, iln above liif as here, but liif above bilinear.*
 #
 # Three things to read from it:
 #
@@ -665,7 +665,7 @@ curves = {name: train(name) for name in ("liif", "iln")}
 
 # %% [markdown]
 # Networks of full size take longer. Beside ours we draw six trainings that are committed with the package, three of
-# each, with 2000 steps and other seeds. (`python -m ilnet experiment convergence` makes that file, in three hours on
+# each, with 2000 steps and three seeds. (`python -m ilnet experiment convergence` makes that file, in three hours on
 # two cores.)
 
 # %%
@@ -708,7 +708,8 @@ assert curves["iln"][1][0] > 5 * curves["liif"][1][0]
 # *In words: IoU and MAE by step. The IoU of iln is above zero from the start and climbs; that of liif stays next to
 # zero all along. In MAE, on a logarithmic axis, liif starts at tens of metres and comes down towards iln, which starts
 # at a few metres. Bilinear is a dashed line. Right, six trainings of full-size networks: the three of iln climb at once
-# and lie close together; the three of liif stay near zero for hundreds of steps, then climb, and end below.*
+# and lie close together; the three of liif stay near zero, with single peaks, for more than a thousand steps, then
+# climb, and end far below.*
 #
 # After a fifth of this short training ILN has an IoU that LIIF does not reach at all in it. It does not start from
 # nothing: the average of four neighbours is a usable range, and it can never leave the span between the nearest and the
@@ -884,14 +885,14 @@ assert max(kept[name] for name in ("iln", "iln-prior", "planes")) < kept["biline
 # *In words: two panels with the six conditions side by side, each method a marker. The order is the same in all six:
 # planes and iln-prior close together, then iln, bilinear, liif. From "as trained" to "narrow" the markers of bilinear,
 # planes and iln-prior go up, that of iln stays, and that of liif falls. At "very wide" iln comes down most. In the hall
-# all lie closer to bilinear, and liif farther below it.*
+# planes, iln-prior and iln lie closer to bilinear, and liif lies farther below it than as trained.*
 #
 # - **Another output size costs nothing**, as it should.
 # - **A narrow field of view is an easier task**: neighbours are closer together, and the rules and `iln-prior` gain.
 #   LIIF *loses*: presumably it has learned how far ranges run apart within one pixel of 2°, and predicts that still.
 # - **A very wide one is harder for everybody**, and ILN loses most. Geometry holds `iln-prior` up: its answers snap to
 #    planes.
-# - **The hall is another world**, and the order survives. Everybody's margin over bilinear shrinks, also that of
+# - **The hall is another world**, and the order survives. Every margin over bilinear shrinks, also that of
 #   `planes`, which has learned nothing: in part the hall is just a good place for bilinear. Of what it had, LIIF loses
 #   most.
 #

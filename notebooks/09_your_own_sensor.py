@@ -28,7 +28,7 @@
 #
 # | | |
 # |---|---|
-# | You know | [01 · Range images](01_what_a_lidar_measures.ipynb), [08 · The comparison](08_the_comparison.ipynb) |
+# | You know | [01 · What a LiDAR measures](01_what_a_lidar_measures.ipynb), [08 · The comparison](08_the_comparison.ipynb) |
 # | Time | 40 minutes, and 40 for the exercises; one to two minutes to run |
 # | Hardware | any computer; a CUDA GPU is used if there is one |
 
@@ -237,7 +237,8 @@ plt.show()
 # %% [markdown]
 # *In words: a strip of points ahead of the car from the side, with a thin line 1.8 m below the sensor. With true angles
 # the road lies along the line, a little above it far ahead, and a low wall stands at 12 m. With even labels the same
-# road lies up to more than two metres deeper, by another amount at each distance, and the wall is three times as tall.*
+# road lies up to more than two metres deeper, by another amount at each distance, and the wall is two and a half times
+# as tall.*
 #
 # `Scan.decimate` and `Sensor.decimate` keep the true angles, and the outermost beams so that nothing has to be
 # extrapolated.
@@ -513,7 +514,7 @@ if FILE is None:
 # on all pixels around. What blends measured ranges keeps the good ones. But `iln`, level with `bilinear-inverse` in
 # notebook 08, is now level with `bilinear`, and `iln-prior`, which snaps to planes, is hardly ahead of
 # `bilinear-inverse`. What is left are the edges: a third of the floating points of the bilinear blends. `planes` is
-# ahead in all of it. Section 6 looks at holes and at wide gaps one by one.
+# ahead in all but the MAE. Section 6 looks at holes and at wide gaps one by one.
 #
 # That was simulated. Frames of real Ouster sensors were measured in the same way, and their figures are committed with
 # the package:
@@ -531,8 +532,8 @@ assert measured["liif"] < 0.6 * measured["bilinear"]
 assert measured["planes"] > measured["iln-prior"] > max(measured["iln"], measured["bilinear-inverse"])
 
 # %% [markdown]
-# The order is that of our frame, so the simulation stands for something: values break, weights bend, and what knows of
-# planes is ahead.
+# The order in IoU is nearly that of our frame (only `iln`, level with `bilinear` there, is ahead of it here), so the
+# simulation stands for something: values break, weights bend, and what knows of planes is ahead.
 
 # %% tags=["goal"]
 clouds = {
@@ -706,9 +707,9 @@ assert rough["iln-prior"][2] < 0.5 * rough["iln"][2]
 # between beams: bilinear sags between beams like a rope, by up to 12 cm; iln wavers by two; iln-prior is straight.*
 #
 # Inverse ranges hardly care about the spacing. Learned habits do; `iln-prior` snaps to planes where it comes close to
-# them. Up to 4° it is a matter of millimetres, though, against cubes of 10 cm: what wide gaps cost in IoU is lost to
-# what they hide, and at edges. The rule of `planes` breaks in its own way: 6° apart, the last two beams that meet the
-# road do so at 11 m and at 34 m, and it takes the stretch between them for an edge.
+# them. Up to 4° what `iln` is off by is a matter of millimetres, though, against cubes of 10 cm: what wide gaps cost in
+# IoU is lost to what they hide, and at edges. The rule of `planes` breaks in its own way: 6° apart, the last two beams
+# that meet the road do so at 11 m and at 34 m, and it takes the stretch between them for an edge.
 
 # %% [markdown]
 # ### A mirrored world, and other units
@@ -958,8 +959,8 @@ for name, model in tried.items():
     assert better[name, "mended"] > better[name, "as it is"]
 
 # %% [markdown]
-# So few steps on one scan gain half a hundredth, which notebook 08 taught us not to believe; mending holes by hand
-# gains more. A training worth its name takes thousands. You have all that it needs:
+# So few steps gain less than a hundredth, on a single scan, which notebook 08 taught us not to believe; mending holes
+# by hand gains two hundredths. A training worth its name takes thousands. You have all that it needs:
 #
 # ```
 # python -m ilnet train iln-prior --preset laptop --out runs       # full size, hours on two cores, less on a GPU

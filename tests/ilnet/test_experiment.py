@@ -66,7 +66,11 @@ def test_convergence_follows_test_figures_over_seeds(study):
         (name, seed, step) for name in ("liif", "iln") for seed in "01" for step in "24"
     }
     assert all(float(row["seconds"]) > 0 for row in found)
-    assert "| steps of liif to the IoU" in experiment.results(study).read_text()
+    page = experiment.results(study).read_text()
+    assert "| steps of liif to the IoU" in page
+    ends = [row for row in found if row["step"] == "4"]
+    assert all(f"| {row['model']} | {row['seed']} | 4 | {row['seconds']} |" in page for row in ends)
+    assert "| iln | 0 | 2 |" not in page
 
 
 def test_steps_to_reach_by_hand():
