@@ -73,6 +73,15 @@ def test_convergence_follows_test_figures_over_seeds(study):
     assert "| iln | 0 | 2 |" not in page
 
 
+def test_the_seconds_of_a_curve_are_of_the_median_pace(tmp_path):
+    log = tmp_path / "from-step-0" / "metrics.csv"
+    log.parent.mkdir()
+    lines = ["step,seconds,test/mae,test/iou,test/floating"]
+    lines += [f"{step},{seconds},2.0,0.3,0.1" for step, seconds in ((99, 10), (199, 20), (299, 5000), (399, 5010))]
+    log.write_text("\n".join(lines) + "\n")  # halted for more than an hour between 200 and 300
+    assert [row["seconds"] for row in experiment._probed(tmp_path)] == pytest.approx([10, 20, 30, 40])
+
+
 def test_steps_to_reach_by_hand():
     curves = {"iln": {10: 0.30, 50: 0.40, 100: 0.41}, "liif": {10: 0.10, 50: 0.29, 100: 0.33}}
     made = [
