@@ -44,6 +44,8 @@ PAPER = {
     },
 }
 
+# Told apart by the colour-blind, and in print.
+_SERIES = "#0072b2", "#e69f00", "#009e73", "#cc79a7"
 _COLOURS = {"liif": "#d55e00", "iln": "#0072b2", "iln-prior": "#009e73", "lidar-sr": "#cc79a7", "bilinear": "#999999"}
 
 
@@ -283,16 +285,20 @@ def rays(study: Study) -> None:
 
 
 def _bars(study: Study, name: str, rows: Sequence[dict[str, Any]], by: str, title: str) -> None:
-    figure = Figure(figsize=(8, 3), layout="constrained")
+    """Draws IoU and MAE by size; kinds that differ behind a comma only share a colour."""
+    figure = Figure(figsize=(9, 3), layout="constrained")
     for axis, (key, words) in zip(figure.subplots(1, 2), (("iou", "IoU"), ("mae", "MAE [m]")), strict=True):
         kinds = list(dict.fromkeys(str(row[by]) for row in rows))
+        colours = dict(zip(dict.fromkeys(kind.partition(",")[0] for kind in kinds), _SERIES, strict=False))
         for number, kind in enumerate(kinds):
             chosen = [row for row in rows if str(row[by]) == kind]
             at = np.arange(len(chosen)) + (number - (len(kinds) - 1) / 2) * 0.8 / len(kinds)
-            axis.bar(at, [row[key] for row in chosen], 0.8 / len(kinds), label=kind)
+            first, comma, _ = kind.partition(",")
+            look = {"color": colours[first], "hatch": "////" if comma else None, "edgecolor": "white", "linewidth": 0}
+            axis.bar(at, [row[key] for row in chosen], 0.8 / len(kinds), label=kind, **look)
         axis.set_xticks(range(len(chosen)), [row["size"] for row in chosen])
         axis.set_ylabel(words)
-    axis.legend(title=title, fontsize=8)
+    axis.legend(title=title, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
     figure.savefig(study.out / f"{name}.png", dpi=120)
 
 
