@@ -4,6 +4,7 @@ What is learned from are rays cast at continuous directions while training goes 
 images stored on disk. Under `torchrun` several processes share each batch.
 """
 
+import atexit
 import math
 import multiprocessing
 import os
@@ -327,8 +328,16 @@ def _processes(number: int) -> dict[str, Any]:
     """How Lightning is told of the processes that `torchrun` started."""
     if number == 1:
         return {"devices": 1}
+    # Lightning leaves a group of CPU processes open, whose threads now and then abort the interpreter on its way out.
+    atexit.unregister(_close_group)
+    atexit.register(_close_group)
     here = int(os.environ["LOCAL_WORLD_SIZE"])
     return {"strategy": "ddp", "devices": here, "num_nodes": number // here}
+
+
+def _close_group() -> None:
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
 
 
 def _validate(trainer: lightning.Trainer, training: Training, scans: DataLoader[tuple[str, int]]) -> dict[str, float]:
