@@ -16,7 +16,7 @@ from typing import Any
 
 import lightning
 import torch
-from lightning.pytorch.callbacks import ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from torch import nn
 from torch.utils.data import DataLoader
@@ -274,10 +274,11 @@ def train(
     return figures
 
 
-class _Last(lightning.Callback):
+class _Last(Checkpoint):
     """Keeps what an interrupted run goes on from: every so many steps, and after each validation.
 
-    Never between a step and its validation, which the run that goes on would leave out.
+    Never between a step and its validation, which the run that goes on would leave out. Being a `Checkpoint`, it is
+    called behind the one that keeps the best, and so remembers how good that was.
     """
 
     def __init__(self, file: Path):

@@ -81,7 +81,7 @@ def test_an_interrupted_run_goes_on_to_the_same_weights(tmp_path, quick, monkeyp
 
 
 def test_a_run_cut_in_a_validation_makes_up_for_it(tmp_path, quick, monkeypatch):
-    monkeypatch.setattr(train, "CHECKPOINT_EVERY", 1)
+    monkeypatch.setattr(train, "CHECKPOINT_EVERY", 10)
     monkeypatch.setattr(train, "VALIDATE_EVERY", (2, 2))
     quick(tmp_path / "whole", steps=6)
     with monkeypatch.context() as cut:
@@ -95,6 +95,8 @@ def test_a_run_cut_in_a_validation_makes_up_for_it(tmp_path, quick, monkeypatch)
         cut.setattr(train.Training, "validation_step", validate_or_die)
         with pytest.raises(SystemError):
             quick(tmp_path / "cut", steps=6)
+    kept = torch.load(tmp_path / "cut" / "iln-prior" / "last.ckpt", weights_only=True)
+    [best] = [state["best_model_score"] for key, state in kept["callbacks"].items() if "ModelCheckpoint" in key]
     quick(tmp_path / "cut", steps=6)
 
     def validated(run):
@@ -106,6 +108,7 @@ def test_a_run_cut_in_a_validation_makes_up_for_it(tmp_path, quick, monkeypatch)
 
     assert [step for step, _ in validated("whole")] == ["1", "3", "5"]
     assert validated("cut") == validated("whole")
+    assert best == pytest.approx(float(validated("cut")[0][1]))  # the run that went on knew how good the best was
     whole, cut = (models.load(tmp_path / run / "iln-prior.safetensors").state_dict() for run in ("whole", "cut"))
     assert all(torch.equal(whole[key], cut[key]) for key in whole)
 
