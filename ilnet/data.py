@@ -199,9 +199,12 @@ class StoredImages(IterableDataset):
         seed: Of the random numbers; seed and number of a batch decide what it holds.
         start: Number of the first batch, for a training that goes on.
         part: (number, of how many) equal parts of each batch to read, for training in several processes.
+        sector: Columns of the input to give, from one drawn at random on; all unless told. For models whose columns
+            do not meet at the seam.
 
     Raises:
-        ValueError: If the archive lacks a size, or its images hold fewer pixels than `queries`.
+        ValueError: If the archive lacks a size, its images hold fewer pixels than `queries`, or their columns are no
+            multiple of those of the input of which a sector is wanted.
     """
 
     def __init__(
@@ -214,16 +217,21 @@ class StoredImages(IterableDataset):
         seed: int,
         start: int = 0,
         part: tuple[int, int] = (0, 1),
+        sector: int | None = None,
     ):
         for size in (source, target):
             if size not in archive.sensors:
                 raise ValueError(f"{archive.path}: holds no scans of size {size}; it has {', '.join(archive.sizes)}")
         sensor, dense = archive.sensors[source], archive.sensors[target]
-        if queries > (pixels := math.prod(dense.shape)):
+        self.times, rest = divmod(dense.shape[1], sensor.shape[1])
+        if sector is not None and rest:
+            raise ValueError(f"columns of {target} are no multiple of those of {source}, of which a sector is wanted")
+        located = sensor.grid_queries(dense)[:, : None if sector is None else sector * self.times]
+        if queries > (pixels := located[..., 0].numel()):
             raise ValueError(f"queries is {queries}; images of {target} have {pixels} pixels")
         self.archive, self.source, self.target, self.scans, self.queries = archive, source, target, scans, queries
         self.seed, self.start, self.part, self.wrap = seed, start, _part(scans, part), sensor.wrap
-        self.located = sensor.grid_queries(dense).view(-1, 2)
+        self.sector, self.located = sector, located.reshape(-1, 2)
 
     def __iter__(self) -> Iterator[Batch]:
         return map(self._read, _numbers(self.start))
@@ -235,9 +243,14 @@ class StoredImages(IterableDataset):
             order = torch.randperm(len(self.archive), generator=_generator(self.seed, 0, epoch))
             scan = int(order[place_in_epoch])
             pixels = torch.randperm(len(self.located), generator=_generator(self.seed, 1, place))[: self.queries]
-            images.append(self.archive.scan(scan, self.source).filled())
+            sparse, dense = (self.archive.scan(scan, size).filled() for size in (self.source, self.target))
+            if self.sector is not None:
+                first = int(torch.randint(sparse.shape[1], (), generator=_generator(self.seed, 2, place)))
+                sparse = sparse.roll(-first, 1)[:, : self.sector]
+                dense = dense.roll(-first * self.times, 1)[:, : self.sector * self.times]
+            images.append(sparse)
             queries.append(self.located[pixels])
-            ranges.append(self.archive.scan(scan, self.target).filled().view(-1)[pixels])
+            ranges.append(dense.reshape(-1)[pixels])
         return Batch(torch.stack(images), torch.stack(queries), torch.stack(ranges), self.wrap)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from ilnet import evaluate, models, plot, towns, train
+from ilnet import data, evaluate, models, plot, towns, train
 
 __all__ = ["EXPERIMENTS", "Study", "results"]
 
@@ -59,7 +59,8 @@ class Study:
         out: Folder for weights, numbers, figures.
         scans: Test scans from each test town.
         seeds: How often a training is repeated where its spread is shown.
-        archive: Stored images, for LiDAR-SR and for the comparison with continuous rays; without it these are left out.
+        archive: Stored images, for the comparison with continuous rays and for LiDAR-SR at those of `SIZES` that it
+            holds; without it these are left out.
         measured: Files of measured scans.
     """
 
@@ -124,13 +125,17 @@ class Study:
 
 def table(study: Study) -> None:
     """The paper's Table II: all methods at three sizes."""
-    files: dict[str, str | Path] = {name: name for name in ("nearest", "bilinear", "bilinear-inverse", "planes")}
-    files |= study.networks()
-    rows = study.compare(files)
-    if study.archive:
-        for size in SIZES[:2]:  # the third takes more memory than most have
+    rules: dict[str, str | Path] = {name: name for name in ("nearest", "bilinear", "bilinear-inverse", "planes")}
+    networks = study.networks()
+    stored = data.open_archive(study.archive).sensors if study.archive else {}
+    methods, rows = {}, []
+    for size in SIZES:
+        lidar_sr = {}
+        if f"{size[0]}x{size[1]}" in stored:
             file = study.trained(f"lidar-sr-{size[0]}", "lidar-sr", archive=study.archive, target=size)
-            rows += study.compare({"lidar-sr": file}, [size])
+            lidar_sr = {"lidar-sr": file}
+        methods[size] = rules | lidar_sr | networks
+        rows += study.compare(methods[size], [size])
     study.write("table", rows)
     figure = Figure(figsize=(10, 3.2), layout="constrained")
     for axis, (name, paper) in zip(figure.subplots(1, len(SIZES), sharey=True), PAPER.items(), strict=True):
@@ -143,13 +148,13 @@ def table(study: Study) -> None:
     axis.legend(fontsize=8)
     figure.axes[0].set_ylabel("IoU")
     figure.savefig(study.out / "table.png", dpi=120)
-    _draw_points(study, files)
+    _draw_points(study, SIZES[1], methods[SIZES[1]])
 
 
-def _draw_points(study: Study, files: dict[str, str | Path]) -> None:
+def _draw_points(study: Study, size: tuple[int, int], files: Mapping[str, str | Path]) -> None:
     """The same crop of a test scan by every method, as points."""
     for town in towns.TEST:
-        [(sparse, dense)] = evaluate.town_pairs(town, 1, evaluate.INPUT.resize(*SIZES[1]))
+        [(sparse, dense)] = evaluate.town_pairs(town, 1, evaluate.INPUT.resize(*size))
         shown = {"input": sparse}
         shown |= {name: models.load(file).upsample(sparse, dense.sensor) for name, file in files.items()}
         plot.point_clouds({**shown, "truth": dense}, study.out / f"points-{town}.png", reach=20.0)

@@ -72,9 +72,10 @@ def point_clouds(scans: dict[str, Scan], path: Path, reach: float = 35.0) -> Non
 
     # Without a screen VTK warns of its absence, then renders all the same.
     with pyvista.vtk_verbosity("off"):
-        columns = 3
+        columns = min((3, 4, 5), key=lambda count: -len(scans) % count)  # that which leaves the fewest places empty
         rows = -(-len(scans) // columns)
-        plotter = pyvista.Plotter(off_screen=True, shape=(rows, columns), window_size=[1800, 480 * rows], border=False)
+        window = [600 * columns, 480 * rows]
+        plotter = pyvista.Plotter(off_screen=True, shape=(rows, columns), window_size=window, border=False)
         for number, (caption, scan) in enumerate(scans.items()):
             plotter.subplot(number // columns, number % columns)
             points = scan.points().cpu()

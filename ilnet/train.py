@@ -308,10 +308,14 @@ def _samples(
         streets = [data.street(town, 0, device) for town in size.towns]
         return data.ContinuousRays(streets, preset(INPUT), size.crops, size.columns, size.queries, seed, start, part)
     source = preset(INPUT).shape
-    # As many columns and as many queries as the crops have, in whole scans. What predicts whole images learns from all.
+    # As many columns and as many queries as the crops have, in whole scans.
     scans = max(1, size.crops * size.columns // source[1])
-    queries = math.prod(target) if name == "lidar-sr" else size.crops * size.queries // scans
-    return data.StoredImages(stored, _words(source), _words(target), scans, queries, seed, start, part)
+    sector = None
+    queries = size.crops * size.queries // scans
+    if name == "lidar-sr":  # it predicts, and learns from, all pixels; their crops are wider, since it halves them
+        sector = min(4 * size.columns, source[1])
+        queries = math.prod(target) * sector // source[1]
+    return data.StoredImages(stored, _words(source), _words(target), scans, queries, seed, start, part, sector)
 
 
 def _words(size: tuple[int, int]) -> str:

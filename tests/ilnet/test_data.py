@@ -205,3 +205,22 @@ def test_an_archive_without_the_size_is_refused(archive):
         data.StoredImages(archive, "9x9", "8x32", 1, 1, 0)
     with pytest.raises(ValueError, match="queries is 257; images of 8x32 have 256 pixels"):
         stored(archive, queries=257)
+
+
+def test_a_sector_is_cut_from_both_images_at_one_place_and_goes_over_the_seam(archive):
+    batches = [batch for _, batch in zip(range(20), stored(archive, scans=1, queries=80, sector=5), strict=False)]
+    firsts = set()
+    for batch in batches:
+        scan = int((batch.image.min() - 10) / 10)
+        sparse, dense = (archive.scan(scan, size).ranges for size in ("4x16", "8x32"))
+        [first] = [k for k in range(16) if torch.equal(sparse.roll(-k, 1)[:, :5], batch.image[0])]
+        row, column = (batch.queries[0] * torch.tensor([7 / 3, 2.0])).round().long().unbind(-1)
+        assert (row.max(), column.max()) == (7, 9)
+        assert torch.equal(dense.roll(-2 * first, 1)[row, column], batch.ranges[0])
+        firsts.add(first)
+    assert len(firsts) > 5
+    assert max(firsts) > 11
+    with pytest.raises(ValueError, match="queries is 81; images of 8x32 have 80 pixels"):
+        stored(archive, queries=81, sector=5)
+    with pytest.raises(ValueError, match="columns of 4x16 are no multiple of those of 8x32"):
+        data.StoredImages(archive, "8x32", "4x16", 1, 1, 0, sector=3)

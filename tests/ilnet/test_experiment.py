@@ -3,7 +3,7 @@ import math
 
 import pytest
 
-from ilnet import evaluate, experiment, metrics, models, train
+from ilnet import data, evaluate, experiment, metrics, models, train
 from ilnet.sensor import preset
 from ilnet.simulate import pose, simulate
 
@@ -123,20 +123,24 @@ def test_without_a_preset_the_networks_that_ship_are_compared(study, monkeypatch
     assert trained == [("iln", "small")]
 
 
-def test_lidar_sr_has_a_network_for_each_size_that_is_stored(study, monkeypatch):
-    asked = []
+def test_lidar_sr_has_a_network_for_each_size_that_is_stored(study, tmp_path, monkeypatch):
+    asked, drawn = [], []
+    archive = tmp_path / "stored"
+    sensors = {size: preset(f"paper-{size}") for size in ("16x1024", "64x1024")}
+    data.Archive.create(archive, 1, sensors, {"towns": ["nowhere"]})
 
     def fake(name, preset_name, folder, archive=None, target=None, **options):
         asked.append((folder.name, name, archive, target))
         models.save(models.create("bilinear"), folder / f"{name}.safetensors", "bilinear", {})
 
     monkeypatch.setattr(train, "train", fake)
-    experiment.table(experiment.Study("tiny", study.out, 1, 1, archive=study.out / "stored"))
-    assert asked[3:] == [
-        ("lidar-sr-16", "lidar-sr", study.out / "stored", (16, 256)),
-        ("lidar-sr-32", "lidar-sr", study.out / "stored", (32, 512)),
-    ]
-    assert [row["model"] for row in rows(study, "table")].count("lidar-sr") == 2
+    monkeypatch.setattr(experiment, "SIZES", ((32, 512), (64, 1024)))
+    monkeypatch.setattr(experiment, "PAPER", dict.fromkeys(("32x512", "64x1024"), experiment.PAPER["32x512"]))
+    monkeypatch.setattr(experiment.plot, "point_clouds", lambda scans, path, reach: drawn.append(list(scans)))
+    experiment.table(experiment.Study("tiny", study.out, 1, 1, archive=archive))
+    assert asked[3:] == [("lidar-sr-64", "lidar-sr", archive, (64, 1024))]
+    assert [row["size"] for row in rows(study, "table") if row["model"] == "lidar-sr"] == ["64x1024"]
+    assert all("lidar-sr" in captions for captions in drawn)
 
 
 def test_ratios_by_hand():
