@@ -191,7 +191,8 @@ def train(
         seed: Of the initial weights and the rays, 0 or more.
         archive: Stored images to learn from instead of continuous rays; see `data.open_archive`. LiDAR-SR has no other
             way to learn.
-        target: Size (rows, columns) of the stored images to learn from; the one that LiDAR-SR predicts.
+        target: Size (rows, columns) of the stored images to learn from; the one that LiDAR-SR predicts, of which it
+            learns all pixels in a sector of a scan at a time.
         probe: Pairs of an input scan and the scan to be predicted, whose figures are logged as `test/...` and decide
             nothing.
         **arguments: Override the model's.
@@ -312,7 +313,7 @@ def _samples(
     scans = max(1, size.crops * size.columns // source[1])
     sector = None
     queries = size.crops * size.queries // scans
-    if name == "lidar-sr":  # it predicts, and learns from, all pixels; their crops are wider, since it halves them
+    if name == "lidar-sr":  # learns from all that it predicts; wider than the others' crops, since it halves it often
         sector = min(4 * size.columns, source[1])
         queries = math.prod(target) * sector // source[1]
     return data.StoredImages(stored, _words(source), _words(target), scans, queries, seed, start, part, sector)
