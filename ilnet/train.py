@@ -192,7 +192,7 @@ def train(
         archive: Stored images to learn from instead of continuous rays; see `data.open_archive`. LiDAR-SR has no other
             way to learn.
         target: Size (rows, columns) of the stored images to learn from; the one that LiDAR-SR predicts, of which it
-            learns all pixels in a sector of a scan at a time.
+            learns all pixels in sectors of scans.
         probe: Pairs of an input scan and the scan to be predicted, whose figures are logged as `test/...` and decide
             nothing.
         **arguments: Override the model's.
@@ -309,13 +309,13 @@ def _samples(
         streets = [data.street(town, 0, device) for town in size.towns]
         return data.ContinuousRays(streets, preset(INPUT), size.crops, size.columns, size.queries, seed, start, part)
     source = preset(INPUT).shape
-    # As many columns and as many queries as the crops have, in whole scans.
-    scans = max(1, size.crops * size.columns // source[1])
-    sector = None
-    queries = size.crops * size.queries // scans
-    if name == "lidar-sr":  # learns from all that it predicts; wider than the others' crops, since it halves it often
-        sector = min(4 * size.columns, source[1])
+    if name == "lidar-sr":
+        # It learns from all that it predicts: of as many scans, since its batch norm fails with one, but half as wide.
+        scans, sector = size.crops, source[1] if size.epochs else size.columns // 2
         queries = math.prod(target) * sector // source[1]
+    else:  # as many columns and as many queries as the crops have, in whole scans
+        scans, sector = max(1, size.crops * size.columns // source[1]), None
+        queries = size.crops * size.queries // scans
     return data.StoredImages(stored, _words(source), _words(target), scans, queries, seed, start, part, sector)
 
 
