@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from safetensors import safe_open
 
 from ilnet import data, evaluate, models, plot, towns, train
 
@@ -105,14 +106,23 @@ class Study:
             rows += evaluate.evaluate(loaded, pairs)
         return rows
 
+    def _steps_of_lidar_sr(self) -> str:
+        files = {size[0]: self.out / "weights" / f"lidar-sr-{size[0]}" / "lidar-sr.safetensors" for size in SIZES}
+        steps = []
+        for rows, file in files.items():
+            if file.exists():
+                with safe_open(file, "pt") as weights:
+                    steps.append(f"{weights.metadata()['steps']} steps for {rows} rows")
+        return ", ".join(steps)
+
     def write(self, name: str, rows: Sequence[dict[str, Any]]) -> None:
         """Writes rows of one kind as NAME.csv, and in about.json what they were made with."""
         self.out.mkdir(parents=True, exist_ok=True)
         shipped = self.preset is None and name in ("table", "real")
         trained = f"networks trained with preset {self.preset or 'small'}"
         networks = "the networks that ship" if shipped else trained
-        if shipped and any(row["model"] == "lidar-sr" for row in rows):
-            networks += ", LiDAR-SR trained with preset small"
+        if any(row.get("model") == "lidar-sr" for row in rows):
+            networks += f"; LiDAR-SR trained with preset {self.preset or 'small'}, {self._steps_of_lidar_sr()}"
         about = _about(self.out) | {name: {"networks": networks}}
         (self.out / "about.json").write_text(json.dumps(about, indent=1) + "\n")
         with open(self.out / f"{name}.csv", "w", newline="") as file:

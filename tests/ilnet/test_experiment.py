@@ -131,7 +131,7 @@ def test_lidar_sr_has_a_network_for_each_size_that_is_stored(study, tmp_path, mo
 
     def fake(name, preset_name, folder, archive=None, target=None, **options):
         asked.append((folder.name, name, archive, target))
-        models.save(models.create("bilinear"), folder / f"{name}.safetensors", "bilinear", {})
+        models.save(models.create("bilinear"), folder / f"{name}.safetensors", "bilinear", {}, steps=7)
 
     monkeypatch.setattr(train, "train", fake)
     monkeypatch.setattr(experiment, "SIZES", ((32, 512), (64, 1024)))
@@ -141,6 +141,7 @@ def test_lidar_sr_has_a_network_for_each_size_that_is_stored(study, tmp_path, mo
     assert asked[3:] == [("lidar-sr-64", "lidar-sr", archive, (64, 1024))]
     assert [row["size"] for row in rows(study, "table") if row["model"] == "lidar-sr"] == ["64x1024"]
     assert all("lidar-sr" in captions for captions in drawn)
+    assert "LiDAR-SR trained with preset tiny, 7 steps for 64 rows." in experiment.results(study).read_text()
 
 
 def test_ratios_by_hand():
