@@ -200,7 +200,7 @@ class StoredImages(IterableDataset):
         start: Number of the first batch, for a training that goes on.
         part: (number, of how many) equal parts of each batch to read, for training in several processes.
         sector: Columns of the input to give, from one drawn at random on; all unless told. For models whose columns
-            do not meet at the seam.
+            do not meet at the seam: `wrap` remains the sensor's, since pixels are spaced as on the full circle.
 
     Raises:
         ValueError: If the archive lacks a size, its images hold fewer pixels than `queries`, or their columns are no
