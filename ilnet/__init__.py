@@ -1,1 +1,26 @@
-"""The Implicit LiDAR Network (ICRA 2022): sensors, scans, towns, models, training and evaluation."""
+"""The Implicit LiDAR Network (ICRA 2022): sensors, scans, towns, models, training and evaluation.
+
+What people use most has a short name here: `from ilnet import data, models, simulate`. Each is imported when it is
+first asked for.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ilnet.learning import evaluate, metrics, train
+    from ilnet.world import effects, meshes, places, simulate, towns
+
+__all__ = ["effects", "evaluate", "meshes", "metrics", "places", "simulate", "towns", "train"]
+
+_ROOMS = {
+    "learning": ("evaluate", "metrics", "train"),
+    "world": ("effects", "meshes", "places", "simulate", "towns"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for room, modules in _ROOMS.items():
+        if name in modules:
+            return import_module(f"ilnet.{room}.{name}")
+    raise AttributeError(f"module 'ilnet' has no attribute {name!r}")

@@ -1,5 +1,5 @@
 """`python -m ilnet`."""
 
-from ilnet.cli import main
+from ilnet.commands.cli import main
 
 main()

@@ -2,12 +2,13 @@
 
 from kernels.area_blend import area_blend
 from kernels.attention import attend_neighbours
-from kernels.fused_decoder import DecoderWeights, fused_decode, fused_decode_serves
 from kernels.gather import gather_neighbours
 from kernels.gather_blend import gather_blend
-from kernels.neighbour_attention import Projected, neighbour_attention, project_pixels
+from kernels.neighbour_attention import neighbour_attention
+from kernels.neighbour_attention.decoder import DecoderWeights, fused_decode, fused_decode_serves
+from kernels.neighbour_attention.table import Projected, project_pixels
 from kernels.plane_prior import plane_prior
-from kernels.raycast import Hits, Mesh
+from kernels.rays.mesh import Hits, Mesh
 
 __all__ = [
     "DecoderWeights",

@@ -12,8 +12,9 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.launch import check_backend, check_floating, launch, overload
-from kernels.neighbours import BLOCKS, area, broadcast_batch, check_queries, query_blocks
+from kernels.checks import broadcast_batch, check_backend, check_floating, check_queries
+from kernels.launch import BLOCKS, launch, overload, query_blocks
+from kernels.stencil import area
 from kernels.vmap import fold_into_batch
 
 __all__ = ["area_blend"]

@@ -15,7 +15,8 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.launch import check_backend, check_floating, launch, overload
+from kernels.checks import check_backend, check_floating
+from kernels.launch import launch, overload
 from kernels.vmap import fold_into_batch
 
 __all__ = ["adj_logits", "attend_neighbours", "softmax_rows"]

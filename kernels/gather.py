@@ -6,8 +6,10 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.launch import check_backend, check_floating, lanes, launch, overload_vectors
-from kernels.neighbours import adjoint_of_gather, broadcast_batch, channel_spans, check_queries, neighbour, offset
+from kernels.checks import broadcast_batch, check_backend, check_floating, check_queries
+from kernels.launch import channel_spans, lanes, launch, overload_vectors
+from kernels.scatter import adjoint_of_gather
+from kernels.stencil import neighbour, offset
 from kernels.vmap import fold_into_batch
 
 __all__ = ["gather_neighbours"]

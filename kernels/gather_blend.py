@@ -20,21 +20,11 @@ import torch
 import warp as wp
 
 from kernels import reference
+from kernels.checks import PRIORS, RANGE_FLOOR, broadcast_batch, check_backend, check_floating, check_queries
 from kernels.lanes import exp2
-from kernels.launch import LEAST, check_backend, check_floating, launch, overload
-from kernels.neighbours import (
-    BLOCKS,
-    PARTS,
-    adjoint_of_gather,
-    area,
-    bounds,
-    broadcast_batch,
-    check_queries,
-    query_blocks,
-    query_of,
-    sum_slices,
-)
-from kernels.reference import PRIORS, RANGE_FLOOR
+from kernels.launch import BLOCKS, LEAST, launch, overload, query_blocks
+from kernels.scatter import PARTS, adjoint_of_gather, sum_slices
+from kernels.stencil import area, bounds, query_of
 from kernels.vmap import fold_into_batch
 
 __all__ = ["gather_blend"]
@@ -216,7 +206,7 @@ def _gather_blend_backward(
     blocks = query_blocks(count, weights.device)
     on_cpu = weights.device.type == "cpu"
     adj_ranges = None if on_cpu or not for_image else weights.new_empty(weights.shape)
-    # On a CPU few threads add up gradients of the image in slices of their own (`kernels.neighbours.sum_by_query`).
+    # On a CPU few threads add up gradients of the image in slices of their own (`kernels.scatter.sum_by_query`).
     slices = -(-PARTS // batch) if batch else 1
     adj_image = weights.new_empty(batch, slices * len(blocks), image[0].numel()) if on_cpu and for_image else None
     for i, (n, part) in enumerate(blocks):

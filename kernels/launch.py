@@ -7,7 +7,6 @@ import math
 import os
 import tempfile
 import threading
-from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -15,18 +14,16 @@ import torch
 import warp as wp
 
 __all__ = [
-    "BACKENDS",
+    "BLOCKS",
     "LEAST",
-    "check_backend",
-    "check_floating",
+    "channel_spans",
     "initialise",
     "lanes",
     "launch",
     "overload",
     "overload_vectors",
+    "query_blocks",
 ]
-
-BACKENDS = ("warp", "torch")
 
 # Below this many threads of work a second core costs more to wake than it saves.
 LEAST = 512
@@ -95,21 +92,6 @@ def _start_warp() -> None:
             # No home to keep compiled kernels in: they are compiled again in the next process.
             wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="warp-")
             wp.init()
-
-
-def check_floating(name: str, tensor: object, dtypes: Iterable[torch.dtype], shape: str) -> None:
-    """Raises TypeError unless `tensor`, the argument called `name`, is a tensor of one of `dtypes`."""
-    dtypes = list(dtypes)
-    if not isinstance(tensor, torch.Tensor) or tensor.dtype not in dtypes:
-        kind = getattr(tensor, "dtype", type(tensor).__name__)
-        known = ", ".join(str(dtype).removeprefix("torch.") for dtype in dtypes)
-        raise TypeError(f"{name} is {kind}; it should be a tensor {shape} of one of {known}")
-
-
-def check_backend(backend: str) -> None:
-    """Raises ValueError unless `backend` is one of `BACKENDS`."""
-    if backend not in BACKENDS:
-        raise ValueError(f"backend is {backend!r}; it should be one of {', '.join(BACKENDS)}")
 
 
 def overload(kernel: wp.Kernel, half: bool = False) -> dict[torch.dtype, wp.Kernel]:
@@ -244,3 +226,22 @@ def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[Any
         for helper in helpers:
             if not helper.cancel():
                 helper.result()
+
+
+# Queries that a thread takes on a CPU, where the vectors of so many fill its registers, and on a GPU.
+BLOCKS = (4, 1)
+
+
+def query_blocks(count: int, device: torch.device) -> list[tuple[int, slice]]:
+    """Which queries go how many to a thread: on a CPU all but the odd ones at the end go in whole blocks."""
+    whole = 0 if device.type == "cuda" else count - count % BLOCKS[0]
+    parts = zip(BLOCKS, [(0, whole), (whole, count)], strict=True)
+    return [(n, slice(*ends)) for n, ends in parts if ends[0] < ends[1]]
+
+
+def channel_spans(blocks: int, device: torch.device) -> tuple[int, int]:
+    """How many blocks of channels a thread handles, and how many threads that takes.
+
+    A CPU core handles all; on a GPU each thread handles one, since neighbouring threads read together.
+    """
+    return (1, blocks) if device.type == "cuda" else (blocks, 1)

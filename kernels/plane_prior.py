@@ -23,9 +23,9 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.launch import check_backend, check_floating, launch, overload
-from kernels.neighbours import bounds, broadcast_batch, check_queries, query_of
-from kernels.reference import PARTED, RANGE_FLOOR, SHARPEST
+from kernels.checks import PARTED, RANGE_FLOOR, SHARPEST, broadcast_batch, check_backend, check_floating, check_queries
+from kernels.launch import launch, overload
+from kernels.stencil import bounds, query_of
 from kernels.vmap import fold_into_batch
 
 __all__ = ["plane_prior"]

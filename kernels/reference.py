@@ -9,11 +9,9 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
+from kernels.checks import PARTED, RANGE_FLOOR, SHARPEST
+
 __all__ = [
-    "PARTED",
-    "PRIORS",
-    "RANGE_FLOOR",
-    "SHARPEST",
     "area_blend",
     "areas",
     "attend_neighbours",
@@ -25,16 +23,6 @@ __all__ = [
     "neighbours",
     "plane_prior",
 ]
-
-PRIORS = ("none", "bilinear", "perspective")
-
-# Metres. The perspective prior divides by range; no LiDAR measures below this.
-RANGE_FLOOR = 0.1
-# Two inverse ranges that differ by more than this share of the smaller one are not of one surface. Of 0.015, 0.03, 0.05
-# and 0.1, what gave `plane_prior` the highest IoU at 128x2048 on scans held out of the training towns.
-PARTED = 0.03
-# A step that is as sharp or sharper has nothing between.
-SHARPEST = 1e3
 
 
 def neighbours(

@@ -42,7 +42,7 @@ import numpy as np
 import pyvista
 import torch
 
-from ilnet import data, metrics, models, simulate
+from ilnet import metrics, models, places, simulate
 from ilnet.course import check, show_scene
 from ilnet.sensor import preset
 
@@ -59,7 +59,7 @@ device = "cuda" if torch.cuda.is_available() else "cpu"
 # with 128 × 2048 rays at the same place: the truth.
 
 # %%
-street = data.street("town10", device=device)
+street = places.street("town10", device=device)
 pose = street.pose(1400)  # (4, 4): where on the street the sensor is, and where it looks
 world = street.world(pose[:3, 3], seed=1400)  # what stands around there, with cars and people of that seed
 

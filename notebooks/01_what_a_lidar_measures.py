@@ -47,8 +47,7 @@ import numpy as np
 import pyvista
 import torch
 
-from ilnet import data, simulate
-from ilnet import scan as scans
+from ilnet import places, scan_files, simulate
 from ilnet.course import check, show_scene
 from ilnet.scan import Scan
 from ilnet.sensor import angles_to_directions, directions_to_angles, preset
@@ -239,7 +238,7 @@ print("all rays:", tuple(rays.shape), " ray (row 4, column 512):", [round(x, 3) 
 # belong to.
 
 # %%
-street = data.street("town01", device=device)
+street = places.street("town01", device=device)
 pose = street.pose(1445)  # (4, 4), sensor frame to town
 world = street.world(pose[:3, 3], seed=0)  # the town, and cars and people
 scan = simulate.simulate(world, paper, pose)
@@ -887,9 +886,9 @@ plt.show()
 # %%
 with tempfile.TemporaryDirectory() as folder:
     for name in ("street.npz", "street.ply"):
-        scans.write(Path(folder) / name, scan)
+        scan_files.write(Path(folder) / name, scan)
         size = (Path(folder) / name).stat().st_size
-        loaded = scans.read(Path(folder) / name, None if name.endswith("npz") else paper)
+        loaded = scan_files.read(Path(folder) / name, None if name.endswith("npz") else paper)
         worst = (loaded.ranges - scan.ranges.cpu()).abs().max()
         print(f"{name}: {size / 1024:.0f} KiB, read again: off by at most {1000 * worst:.3f} mm")
         assert worst < 1e-3

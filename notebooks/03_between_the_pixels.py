@@ -39,7 +39,7 @@ import matplotlib.pyplot as plt
 import torch
 from ipywidgets import interact
 
-from ilnet import data, simulate
+from ilnet import places, simulate
 from ilnet.course import Cells, check, draw_thread
 from ilnet.sensor import angles_to_directions, preset
 from kernels import gather_blend, gather_neighbours
@@ -52,7 +52,7 @@ COLOURS = {"bilinear": "#999999", "perspective": "#e69f00", "truth": "black"}
 # ask for any other ray.
 
 # %%
-street = data.street("town01", device=device)
+street = places.street("town01", device=device)
 WAYPOINT = 1445
 sensor = preset("paper-16x1024")
 pose = street.pose(WAYPOINT)

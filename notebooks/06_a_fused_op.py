@@ -691,7 +691,7 @@ draw_thread(
 # | pixel of `order[k]` | 5 | 5 | 6 | 6 | 9 | 9 | 10 | 10 |
 #
 # Pixel p's terms are `order[starts[p]]` to `order[starts[p + 1] - 1]`: for pixel 6, `starts[6]` is 2 and `starts[7]`
-# is 4; for pixels 7 and 8 both ends are 4, no terms. The library's ops do this on GPUs (`kernels/neighbours.py`,
+# is 4; for pixels 7 and 8 both ends are 4, no terms. The library's ops do this on GPUs (`kernels/scatter.py`,
 # `sum_by_pixel`; they sort the *cells* between pixels, a quarter as many). On CPUs each core adds to an image of its
 # own, and these are summed.
 #

@@ -50,7 +50,7 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 import ilnet
-from ilnet import data, metrics, models
+from ilnet import data, metrics, models, places
 from ilnet.course import Cells, check, draw_thread
 from ilnet.models.base import OFFSET_SCALE
 from ilnet.sensor import angles_to_directions, preset
@@ -760,10 +760,10 @@ for name, values in clock.items():
 STEPS = 30 if FAST else 300
 SEEDS = 0, 1
 coarse, fine = preset("paper-16x1024"), preset("paper-64x1024")
-town = data.street("town01", device=device)
+town = places.street("town01", device=device)
 rays = iter(data.ContinuousRays([town], coarse, crops=2, columns=48, queries=256, seed=0))
 batches = [next(rays) for _ in range(STEPS)]
-[(scan, truth)] = data.held_out_scans(town, 1, [coarse, fine])
+[(scan, truth)] = places.held_out_scans(town, 1, [coarse, fine])
 
 
 def train(depth, seed):

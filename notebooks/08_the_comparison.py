@@ -44,10 +44,10 @@ import pyvista
 import torch
 
 import ilnet
-from ilnet import data, metrics, models, simulate, towns
+from ilnet import data, metrics, models, places, simulate, towns
+from ilnet.commands.experiment import PAPER
 from ilnet.course import check, show_scene
-from ilnet.evaluate import INPUT
-from ilnet.experiment import PAPER
+from ilnet.learning.evaluate import INPUT
 from kernels import Mesh
 
 FAST = True  # False: ten times the steps, and more scans
@@ -265,14 +265,16 @@ def voxel_iou(predicted, true, low, high):  # divides by zero
 # ## 2. Why they disagree
 #
 # Now real predictions. The test towns are `town07` (a village) and `town10` (an old centre). No network was trained in
-# them and nothing was chosen by what it did in them. `data.held_out_scans` takes the same evenly spread waypoints with
+# them and nothing was chosen by what it did in them. `places.held_out_scans` takes the same evenly spread waypoints with
 # each of several sensors: the input of 16×1024 rays and the truths of 64×1024 and 128×2048.
 
 # %%
 SCANS = 4 if FAST else 10  # from each town
 FINE, FINEST = INPUT.resize(64, 1024), INPUT.resize(128, 2048)
-streets = {name: data.street(name, device=device) for name in towns.TEST}
-scans = [triple for street in streets.values() for triple in data.held_out_scans(street, SCANS, [INPUT, FINE, FINEST])]
+streets = {name: places.street(name, device=device) for name in towns.TEST}
+scans = [
+    triple for street in streets.values() for triple in places.held_out_scans(street, SCANS, [INPUT, FINE, FINEST])
+]
 pairs = {"64x1024": [(sparse, fine) for sparse, fine, _ in scans]}
 pairs["128x2048"] = [(sparse, finest) for sparse, _, finest in (scans[1::SCANS] if FAST else scans)]
 print({size: f"{len(some)} scans" for size, some in pairs.items()})
@@ -386,7 +388,7 @@ show_scene(plotter)
 # ## 3. The table
 #
 # All methods, on the same scans. (`bilinear-inverse` is the *perspective* blend of notebook 03.) `python -m ilnet
-# evaluate` and `ilnet.evaluate.evaluate` do the same and return the means; we keep the figures of every scan, since we
+# evaluate` and `ilnet.learning.evaluate.evaluate` do the same and return the means; we keep the figures of every scan, since we
 # want to look at their spread. A `models.Upsampler` prepares once what all scans have in common.
 #
 # If you have trained weights of your own, name their file in `OWN` at the top, and they stand in the table. A minute or
@@ -634,8 +636,8 @@ def paired_difference(one, other):  # zero instead of unknown
 # %%
 STEPS = 100 if FAST else 1000
 SECTOR = replace(FINE, azimuths=FINE.azimuths[384:640])
-validation = data.held_out_scans(data.street("town01", seed=1, device=device), 3, [INPUT, SECTOR])
-rays = iter(data.ContinuousRays([data.street("town01", device=device)], INPUT, 4, 64, 512, seed=0))
+validation = places.held_out_scans(places.street("town01", seed=1, device=device), 3, [INPUT, SECTOR])
+rays = iter(data.ContinuousRays([places.street("town01", device=device)], INPUT, 4, 64, 512, seed=0))
 batches = [next(rays) for _ in range(STEPS)]
 
 

@@ -44,8 +44,8 @@ import numpy as np
 import pyvista
 import torch
 
-import ilnet.scan
-from ilnet import data, evaluate, metrics, models, simulate
+import ilnet.scan_files
+from ilnet import data, evaluate, metrics, models, places, simulate
 from ilnet.course import check, show_scene
 from ilnet.scan import Scan
 from ilnet.sensor import PRESETS, Sensor, preset
@@ -205,7 +205,7 @@ def own_sensor(beams_deg, columns, clockwise, low, high):  # the last column rep
 # beams. What becomes of a level road?
 
 # %%
-street = data.street("town10", device=device)  # a test town: no network was trained in it
+street = places.street("town10", device=device)  # a test town: no network was trained in it
 waypoint = len(street.town.waypoints) // 3
 pose = street.pose(waypoint)
 world = street.world(pose[:3, 3], waypoint)
@@ -229,7 +229,7 @@ for scan, marker, colour, label in (
     points = scan.points().cpu()
     strip = points[(points[:, 1].abs() < 1.0) & (points[:, 0] > 0) & (points[:, 0] < 40)]
     axes.plot(strip[:, 0], strip[:, 2], marker, color=colour, markersize=4, label=label, linestyle="", alpha=0.7)
-axes.axhline(-data.SENSOR_HEIGHT, color="black", lw=0.8)
+axes.axhline(-places.SENSOR_HEIGHT, color="black", lw=0.8)
 axes.set(xlabel="ahead, x [m]", ylabel="height, z [m]", ylim=(-8, 4))
 axes.legend(loc="upper left")
 plt.show()
@@ -332,7 +332,7 @@ def keep(scan, rows):  # the first so many
 # wide as 3 mrad, intensities, and a car that drives 10 m/s and turns while the head turns. If you have a scan of your
 # own, name it in `FILE` at the top and run on: section 4 and `dense.ply` in section 5 take yours.
 #
-# `ilnet.scan.read` takes, by suffix:
+# `ilnet.scan_files.read` takes, by suffix:
 #
 # | suffix | holds | knows its sensor |
 # |---|---|---|
@@ -356,7 +356,7 @@ effects = simulate.Effects(
 )
 frame = simulate.simulate(world, measuring, pose, effects, seed=0)
 
-ilnet.scan.write(folder / "frame.npz", frame)  # whole and without loss
+ilnet.scan_files.write(folder / "frame.npz", frame)  # whole and without loss
 np.save(folder / "frame.npy", frame.ranges.cpu().numpy())
 points = torch.nn.functional.pad(frame.points(), (0, 1)).cpu().numpy()  # x, y, z and an intensity of 0
 points.tofile(folder / "frame.bin")
@@ -364,16 +364,16 @@ for file in sorted(folder.glob("frame.*")):
     print(f"{file.name}: {file.stat().st_size / 1024:.0f} KiB")
 
 # %%
-again = ilnet.scan.read(folder / "frame.npz")
+again = ilnet.scan_files.read(folder / "frame.npz")
 assert again.sensor == measuring
 assert torch.equal(again.ranges, frame.ranges.cpu())
 try:
-    ilnet.scan.read(folder / "frame.npy")
+    ilnet.scan_files.read(folder / "frame.npy")
 except ValueError as error:
     print("frame.npy, without a sensor:", str(error).partition("frame.npy: ")[2])
 total = len(points)
 for label, sensor in (("taken for hdl-64e", None), ("told os1-64", measuring)):
-    found = ilnet.scan.read(folder / "frame.bin", sensor)
+    found = ilnet.scan_files.read(folder / "frame.bin", sensor)
     kept_points = int((found.ranges > 0).sum())
     empty = (found.ranges == 0).all(1).sum()
     print(f"frame.bin, {label}: {kept_points:,} of {total:,} points found a pixel, {empty} of 64 rows are empty")
@@ -570,7 +570,7 @@ show_scene(plotter)
 # %%
 target = replace(preset("os1-128"), max_range=80.0, norm_range=100.0)
 dense = loaded["iln-prior"].upsample(sparse, target)
-ilnet.scan.write(folder / "dense.ply", dense)
+ilnet.scan_files.write(folder / "dense.ply", dense)
 cloud = pyvista.read(folder / "dense.ply")
 print(f"dense.ply: {cloud.n_points:,} points from {(sparse.ranges > 0).sum():,}")
 assert cloud.n_points == int((dense.ranges > 0).sum())
@@ -582,7 +582,7 @@ for number in range(3):  # the car drives on, a metre each frame
     ahead[:3, 3] += number * pose[:3, 0]
     scan = simulate.simulate(world, thinned, ahead, effects, seed=number)
     path = folder / f"frame-{number}.ply"
-    ilnet.scan.write(path, frames(scan))
+    ilnet.scan_files.write(path, frames(scan))
     print(f"{path.name}: {path.stat().st_size / 2**20:.1f} MiB")
 
 # %% [markdown]
@@ -729,7 +729,7 @@ for name, value in mirror.items():
     print(f"{name:>9}: IoU {suffered[name][0]:.3f}, mirrored {value:.3f}")
     assert abs(value - suffered[name][0]) < 0.03
 
-ilnet.scan.write(folder / "millimetres.npz", Scan(frame.ranges * 1000, measuring))
+ilnet.scan_files.write(folder / "millimetres.npz", Scan(frame.ranges * 1000, measuring))
 try:
     evaluate.scan_pair(folder / "millimetres.npz", 16)
 except ValueError as error:
@@ -930,7 +930,7 @@ plt.show()
 # %%
 STEPS = 40 if FAST else 400
 upright = replace(thinned, elevations=np.sort(thinned.elevations), azimuths=np.sort(thinned.azimuths))
-places = [data.street(name, device=device) for name in ("town01", "town03")]
+places = [places.street(name, device=device) for name in ("town01", "town03")]
 batches = iter(data.ContinuousRays(places, upright, crops=4, columns=64, queries=512, seed=0))
 tuned = models.load("iln-prior").to(device).train()
 optimizer = torch.optim.Adam(tuned.parameters(), lr=2e-4)
@@ -969,7 +969,7 @@ for name, model in tried.items():
 # ```
 #
 # The command trains for the paper's 16 beams. For another sensor write the loop above, longer: with a schedule for the
-# rate (`ilnet/train.py` has one), with validation scans of your sensor from towns that are not trained in, and with
+# rate (`ilnet/learning/train.py` has one), with validation scans of your sensor from towns that are not trained in, and with
 # `models.save(model, "mine.safetensors", "iln-prior", {})` at the end. Keep the rules in your tables. On scans with
 # many holes `planes` is what a network has to beat.
 #

@@ -20,7 +20,7 @@ from kernels import (
     plane_prior,
     project_pixels,
 )
-from kernels.reference import PRIORS
+from kernels.checks import PRIORS
 
 __all__ = ["ILN"]
 

@@ -5,7 +5,8 @@ import pytest
 import torch
 from tqdm import tqdm
 
-from ilnet import cli, data, towns
+from ilnet.commands import cli
+from ilnet.world import places, towns
 from kernels import Mesh
 
 
@@ -46,7 +47,7 @@ def quiet_street():
         nobody = np.zeros((0, 4), np.float32)
         headings = np.zeros(len(waypoints), np.float32)
         town = towns.Town("yard", 0, np.zeros((0, 3)), np.zeros((0, 3)), waypoints, headings, nobody, nobody)
-        return data.Street(town, mesh)
+        return places.Street(town, mesh)
 
     return make
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from ilnet import scan as scan_module
-from ilnet.scan import Scan, read, write
+from ilnet import scan_files as scan_module
+from ilnet.scan import Scan
+from ilnet.scan_files import read, write
 from ilnet.sensor import Sensor, preset
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "scans"

@@ -11,15 +11,15 @@ from kernels.launch import initialise
 MODULES = [
     "area_blend",
     "attention",
-    "fused_attention",
-    "fused_decoder",
     "gather",
     "gather_blend",
-    "neighbour_attention",
-    "neighbours",
+    "neighbour_attention.decoder",
+    "neighbour_attention.heads",
+    "neighbour_attention.vectors",
     "plane_prior",
-    "projection",
-    "raycast",
+    "rays.mesh",
+    "rays.projection",
+    "scatter",
 ]
 
 

@@ -3,7 +3,7 @@ import torch
 
 from kernels import gather_neighbours
 from kernels.gather import _gather_neighbours
-from kernels.neighbours import sum_by_pixel, sum_by_query
+from kernels.scatter import sum_by_pixel, sum_by_query
 
 # A gradient sums a few thousand float32 products at most.
 SUM = 1e-4

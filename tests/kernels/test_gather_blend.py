@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kernels import gather_blend
+from kernels.checks import PRIORS, RANGE_FLOOR
 from kernels.gather_blend import _gather_blend
-from kernels.reference import PRIORS, RANGE_FLOOR
 
 # float32 rounds ranges below 100 m to 8e-6 m; a blend of four adds a few roundings.
 METRES = 5e-5

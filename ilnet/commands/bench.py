@@ -1,0 +1,491 @@
+"""Benchmarks: our ops, frames, training steps and rays beside what a user would otherwise write, in one run.
+
+Each pair is warmed up and then timed in turns, so that both meet the same machine; a row gives medians. "The authors'
+formulation" is the network as their code does it (paper, Figs. 2 and 3), in plain PyTorch and our own words: every
+neighbour of every query is gathered, embedded and projected, and each operation passes over all of them.
+"""
+
+import contextlib
+import ctypes
+import gc
+import math
+import shutil
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import nn
+from tqdm import tqdm  # type: ignore[import-untyped]
+
+from ilnet import data, models
+from ilnet.commands import demo
+from ilnet.learning import train as training
+from ilnet.models.base import OFFSET_SCALE, normalised
+from ilnet.scan import Scan
+from ilnet.sensor import Sensor, preset
+from ilnet.world import places, simulate
+from ilnet.world.simulate import best_device
+from kernels import area_blend, gather_blend, neighbour_attention, project_pixels, reference
+
+__all__ = ["SECTIONS", "Row", "bench", "peak_memory", "table"]
+
+INPUT, OUTPUT, LARGE = "paper-16x1024", "paper-128x2048", (256, 4096)
+TOWN = "town01"
+# Queries of an op: those of a frame, and a quarter of it where each has 4 tokens of 64 numbers.
+BLENDS, TOKENS = 262_144, 65_536
+TRAIN_SCANS, TRAIN_QUERIES = 4, 16_384
+# Cast in one call: a GPU has room for several.
+SCANS = {"cpu": 1, "cuda": 16}
+CHUNK = 2048
+
+ROUNDS = 3
+
+
+@dataclass
+class Row:
+    """One comparison."""
+
+    name: str
+    size: str
+    ours_s: float
+    """Seconds, median."""
+    other: str
+    """What the other is, in plain words."""
+    other_s: float
+    ratio: float
+    """other_s / ours_s."""
+    max_abs_diff: float
+    """Between the two results, in their unit."""
+    peak_mb: float | None = None
+    """What ours took beyond what it found and returned, where it was measured."""
+    mean_abs_diff: float = field(default=0.0, kw_only=True)
+
+    def json(self) -> dict[str, Any]:
+        """The row as JSON values."""
+        values = asdict(self)
+        del values["mean_abs_diff"]
+        return values
+
+
+Work = Callable[[], list[torch.Tensor]]
+
+
+def _compare(name: str, size: str, ours: Work, others: dict[str, Work], repeat: int = 1) -> Iterator[Row]:
+    """Times `ours` and each of the others in turns, `repeat` calls in each of the rounds; one row for each other."""
+    for words, other in others.items():
+        results = [torch.cat([part.detach().float().flatten() for part in work()]) for work in (ours, other)]
+        times: tuple[list[float], list[float]] = ([], [])
+        for _ in range(ROUNDS):
+            for work, seconds in zip((ours, other), times, strict=True):
+                time.sleep(0.1)  # torch's threads stay awake for a while, on cores that the next one wants
+                for _ in range(repeat // 5):  # back to its warm state; what takes long is not as sensitive
+                    work()
+                for _ in range(repeat):
+                    _wait()
+                    start = time.perf_counter()
+                    work()
+                    _wait()
+                    seconds.append(time.perf_counter() - start)
+        a, b = (statistics.median(seconds) for seconds in times)
+        difference = (results[0] - results[1]).abs()
+        yield Row(name, size, a, words, b, b / a, float(difference.max()), mean_abs_diff=float(difference.mean()))
+
+
+def _wait() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+def _compiled(work: Callable[..., torch.Tensor], device: torch.device) -> Callable[..., torch.Tensor] | None:
+    """`torch.compile` of a function where its default backend finds a compiler, else None."""
+    if device.type == "cpu" and not (shutil.which("g++") or shutil.which("clang++")):
+        return None
+    return torch.compile(work, fullgraph=True)
+
+
+def _with_backward(work: Callable[..., torch.Tensor], leaves: list[torch.Tensor]) -> Work:
+    def run() -> list[torch.Tensor]:
+        result = work()
+        return [result, *torch.autograd.grad(result.mean(), leaves)]
+
+    return run
+
+
+def _no_gradients(work: Callable[..., torch.Tensor]) -> Work:
+    def run() -> list[torch.Tensor]:
+        with torch.no_grad():
+            return [work()]
+
+    return run
+
+
+def ops() -> Iterator[Row]:
+    """The fused ops beside plain PyTorch."""
+    device = best_device()
+    torch.manual_seed(0)
+    source, target = preset(INPUT), preset(OUTPUT)
+    queries = source.grid_queries(target).view(1, -1, 2).to(device)
+    image = (torch.rand(1, *source.shape, device=device) * 70 + 3).requires_grad_()
+    scores = torch.randn(1, BLENDS, 4, device=device, requires_grad=True)
+    yield from _both(
+        "gather_blend",
+        f"{BLENDS} queries",
+        partial(gather_blend, image, queries, scores),
+        partial(gather_blend, image, queries, scores, backend="torch"),
+        [image, scores],
+        device,
+    )
+    no_scores = torch.zeros_like(scores)
+    yield from _both(
+        "gather_blend",
+        f"{BLENDS} queries, bilinear prior",
+        partial(gather_blend, image, queries, no_scores, "bilinear"),
+        partial(_grid_sample, image, queries),
+        [image],
+        device,
+        "F.grid_sample, a column added at the seam",
+    )
+    yield from _both(
+        "area_blend",
+        f"{BLENDS} queries",
+        partial(area_blend, scores, queries),
+        partial(area_blend, scores, queries, backend="torch"),
+        [scores],
+        device,
+    )
+    model = models.ILN(blocks=1).to(device)
+    attention: Any = model.blocks[0].get_submodule("attention")
+    features = torch.randn(1, 64, *source.shape, device=device).contiguous(memory_format=torch.channels_last)
+    features.requires_grad_()
+    some = queries[:, : 4 * TOKENS : 4].contiguous()
+    leaves = [features, *attention.parameters(), *model.position.parameters()]
+    yield from _both(
+        "neighbour_attention",
+        f"{TOKENS} queries, 64 channels, 8 heads",
+        partial(_our_attention, model, features, some),
+        lambda: _attention(attention, _embed(model, features, some)[0]).view(1, -1, 4, 64),
+        leaves,
+        device,
+    )
+
+
+def _both(
+    name: str,
+    size: str,
+    ours: Callable[..., torch.Tensor],
+    plain: Callable[..., torch.Tensor],
+    leaves: list[torch.Tensor],
+    device: torch.device,
+    words: str = "eager torch",
+) -> Iterator[Row]:
+    for suffix, wrap in (("-forward", _no_gradients), ("-forward-backward", partial(_with_backward, leaves=leaves))):
+        others = {words: wrap(plain)}
+        compiled = _compiled(plain, device)
+        if compiled is not None and words == "eager torch":
+            others["torch.compile"] = wrap(compiled)
+        yield from _compare(name + suffix, size, wrap(ours), others, repeat=15)
+
+
+def _grid_sample(image: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
+    """Bilinear interpolation as torch has it: corners are pixel centres, the first column follows the last."""
+    closed = torch.cat((image, image[..., :1]), -1).unsqueeze(1)
+    size = queries.new_tensor([image.shape[1] - 1, image.shape[2]])
+    grid = (queries % size.new_tensor([math.inf, image.shape[2]])) * (2 / size) - 1
+    return F.grid_sample(closed, grid.flip(-1).unsqueeze(1), padding_mode="border", align_corners=True).view(1, -1)
+
+
+def _our_attention(model: models.ILN, features: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
+    attention: Any = model.blocks[0].attention
+    position = model.position.weight * OFFSET_SCALE, model.position.bias
+    norm = attention.norm.weight, attention.norm.bias
+    projected = project_pixels(features, position, norm, attention.qkv.weight, attention.heads)
+    return neighbour_attention(projected, queries, (attention.out.weight, attention.out.bias))
+
+
+def _embed(model: models.ILN, features: torch.Tensor, queries: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Tokens (N, 4, C) of all queries, and the pixels they came from."""
+    batch, _, height, width = features.shape
+    rows, columns, offsets = reference.neighbours(queries, height, width, True)
+    images = torch.arange(batch, device=features.device).view(-1, 1, 1)
+    pixels = (images * height + rows) * width + columns
+    z = features.movedim(1, 3).reshape(-1, features.shape[1])[pixels]
+    return (z + model.position(offsets * OFFSET_SCALE)).flatten(0, 1), pixels
+
+
+def _attention(attention: Any, x: torch.Tensor) -> torch.Tensor:
+    """A pre-norm attention step on tokens (N, 4, C)."""
+    q, k, v = attention.qkv(attention.norm(x)).view(len(x), 4, 3, attention.heads, -1).permute(2, 0, 3, 1, 4)
+    weights = (q @ k.transpose(-1, -2) / math.sqrt(q.shape[-1])).softmax(-1)
+    return x + attention.out((weights @ v).transpose(1, 2).reshape(x.shape))
+
+
+def _plain_encode(model: models.ILN, image: torch.Tensor) -> torch.Tensor:
+    def conv(layer: nn.Conv2d, x: torch.Tensor) -> torch.Tensor:
+        x = F.pad(F.pad(x, (1, 1, 0, 0), "circular"), (0, 0, 1, 1), "replicate")
+        return F.conv2d(x, layer.weight.contiguous(), layer.bias)
+
+    encoder: Any = model.encoder
+    head = x = conv(encoder.head, normalised(image, model.norm_range))
+    for block in encoder.blocks:
+        x = x + conv(block.second, conv(block.first, x).relu())
+    return head + conv(encoder.tail, x)
+
+
+def _plain_decode(
+    model: models.ILN, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor
+) -> torch.Tensor:
+    x, pixels = _embed(model, features, queries)
+    block: Any
+    for block in model.blocks:
+        x = _attention(block.attention, x)
+        x = x + block.feed_forward(x)
+    weights = model.head(x).squeeze(-1).softmax(-1)
+    return (weights * image.flatten()[pixels].flatten(0, 1)).sum(-1).view(queries.shape[:2])
+
+
+def _plain_frame(model: models.ILN, image: torch.Tensor, queries: torch.Tensor, chunk: int) -> torch.Tensor:
+    features = _plain_encode(model, image)
+    chunks = queries.split(chunk, 1)
+    return torch.cat([_plain_decode(model, features, image, part) for part in chunks], 1)
+
+
+def frame() -> Iterator[Row]:
+    """A frame of ILN at D = 1, from the scan to the ranges."""
+    device = best_device()
+    torch.manual_seed(0)
+    model = models.ILN().eval().to(device)
+    scan, _ = demo.from_town()
+    scan = Scan(scan.ranges.to(device), scan.sensor)
+    source, target = scan.sensor, preset(OUTPUT)
+    for precision in models.PRECISIONS:
+        for wanted in (target, target.resize(*LARGE)):
+            whole = wanted is target  # the large one whole would take 6 GB
+            chunks = {f"the authors' formulation, {CHUNK} queries at a time": CHUNK}
+            if whole:
+                chunks = {"the authors' formulation": math.prod(wanted.shape), **chunks}
+            image = scan.filled(model.norm_range).unsqueeze(0)
+            queries = source.grid_queries(wanted).view(1, -1, 2).to(device)
+            upsampler = models.Upsampler(model, source, wanted, precision, device)
+            ours = partial(_frame, upsampler, scan)
+            peak = peak_memory(ours, device)
+            size = "{}x{} -> {}x{}".format(*source.shape, *wanted.shape)
+            plain = {
+                words: _no_gradients(partial(_plain_frame, model, image, queries, chunk))
+                for words, chunk in chunks.items()
+            }
+            for row in _compare(f"frame-{precision}", size, ours, plain):
+                row.peak_mb = peak
+                yield row
+
+
+def _frame(upsampler: models.Upsampler, scan: Scan) -> list[torch.Tensor]:
+    return [upsampler.ranges(scan)]
+
+
+def train() -> Iterator[Row]:
+    """A step of training: encoder, decoder, L1, their gradients and Adam, in bfloat16 where `ilnet train` uses it."""
+    device = best_device()
+    torch.manual_seed(0)
+    model = models.ILN().train().to(device)
+    source = preset(INPUT)
+    image = torch.rand(TRAIN_SCANS, *source.shape, device=device) * 70 + 3
+    size = torch.tensor([source.shape[0] - 1, source.shape[1]], device=device)
+    queries = torch.rand(TRAIN_SCANS, TRAIN_QUERIES, 2, device=device) * size
+    truth = torch.rand(TRAIN_SCANS, TRAIN_QUERIES, device=device) * 70 + 3
+    optimizer = torch.optim.Adam(model.parameters(), lr=0.0)
+
+    def step(predict: Callable[[], torch.Tensor]) -> list[torch.Tensor]:
+        optimizer.zero_grad()
+        predicted = predict()
+        (predicted - truth).abs().mean().backward()
+        optimizer.step()
+        return [predicted]
+
+    def ours() -> torch.Tensor:
+        with torch.autocast(device.type, torch.bfloat16):
+            return model(image, queries)
+
+    def plain() -> torch.Tensor:
+        return _plain_decode(model, _plain_encode(model, image), image, queries)
+
+    yield from _compare(
+        "train-step",
+        f"{TRAIN_SCANS} scans x {TRAIN_QUERIES} queries",
+        partial(step, ours),
+        {"the authors' formulation, eager, float32": partial(step, plain)},
+    )
+    yield from _draw_batches(model, optimizer, device)
+
+
+def _draw_batches(model: models.ILN, optimizer: torch.optim.Optimizer, device: torch.device) -> Iterator[Row]:
+    """What it takes to draw a batch of continuous rays, beside the step of training that it is for."""
+    size = training.PRESETS["tiny"]
+    street = places.street(TOWN, 0, device)
+    rays = data.ContinuousRays([street], preset(INPUT), size.crops, size.columns, size.queries, seed=0)
+    batches = iter(rays)
+    batch = next(batches)
+    image, queries, truth = (tensor.to(device) for tensor in (batch.image, batch.queries, batch.ranges))
+
+    nothing = [torch.zeros(1)]  # they have no result in common
+
+    def draw() -> list[torch.Tensor]:
+        next(batches)
+        return nothing
+
+    def step() -> list[torch.Tensor]:
+        optimizer.zero_grad()
+        with torch.autocast(device.type, torch.bfloat16):
+            predicted = model(image, queries, wrap=False)
+        (predicted - truth).abs().mean().backward()
+        optimizer.step()
+        return nothing
+
+    yield from _compare(
+        "continuous-rays",
+        f"{size.crops} crops x {size.queries} rays, one batch",
+        draw,
+        {"the training step of iln that takes it": step},
+        repeat=3,
+    )
+
+
+def rays() -> Iterator[Row]:
+    """Scans cast in a town, beside Open3D's and embreex's rays where these are installed."""
+    device = best_device()
+    street = places.street(TOWN, 0, device)
+    poses = torch.stack([street.pose(number) for number in range(0, 100 * SCANS[device.type], 100)])
+    for sensor in (preset("paper-64x1024"), preset(OUTPUT), preset(OUTPUT).resize(*LARGE)):
+        size = "{} x {}x{}, {:.0f}k triangles".format(len(poses), *sensor.shape, len(street.town.triangles) / 1000)
+        cast = partial(_cast, street, sensor, poses)
+        alone: dict[str, Work] = {"the same BVH on one core, as Warp launches it": partial(_on_one_core, cast)}
+        if device.type == "cuda":
+            yield from _compare("rays-bvh", size, cast, _embree(street, sensor, poses), repeat=3)
+            continue
+        yield from _compare("rays-bvh", size, cast, alone)
+        project = partial(_project, street, sensor, poses)
+        yield from _compare("rays-projection", size, project, {"our BVH on all cores": cast, **alone})
+        yield from _compare("rays-projection", size, project, _embree(street, sensor, poses), repeat=5)
+
+
+def _cast(street: places.Street, sensor: Sensor, poses: torch.Tensor) -> list[torch.Tensor]:
+    return [simulate.cast(street.mesh, poses, sensor.directions().view(-1, 3), sensor.max_range)]
+
+
+def _project(street: places.Street, sensor: Sensor, poses: torch.Tensor) -> list[torch.Tensor]:
+    tables = torch.tensor(sensor.elevations), torch.tensor(sensor.azimuths)
+    return [street.mesh.project(pose, *tables, sensor.max_range) for pose in poses]
+
+
+def _embree(street: places.Street, sensor: Sensor, poses: torch.Tensor) -> dict[str, Work]:
+    """The same rays by other libraries, for those that are installed; they are given the rays ready-made."""
+    directions = (sensor.directions().view(-1, 3).double() @ poses[:, :3, :3].mT).float()
+    origins = poses[:, None, :3, 3].float().expand_as(directions)
+    rays = torch.cat((origins, directions), 2).view(-1, 6).numpy()
+    vertices, triangles = street.town.vertices, street.town.triangles
+    found: dict[str, Work] = {}
+    with contextlib.suppress(ImportError):
+        import open3d
+
+        scene = open3d.t.geometry.RaycastingScene(nthreads=torch.get_num_threads())
+        scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(triangles.astype("uint32")))
+        found["Open3D"] = lambda: [_limited(scene.cast_rays(open3d.core.Tensor(rays))["t_hit"].numpy(), sensor)]
+    with contextlib.suppress(ImportError):
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        world = EmbreeScene()
+        TriangleMesh(world, vertices, triangles)
+        start, way = (rays[:, half].copy() for half in (slice(0, 3), slice(3, 6)))
+        found["embreex, one core"] = lambda: [_limited(world.run(start, way, query="DISTANCE"), sensor)]
+    return found
+
+
+def _limited(distances: np.ndarray, sensor: Sensor) -> torch.Tensor:
+    ranges = torch.from_numpy(distances)
+    return ranges.where(ranges <= sensor.max_range, 0.0)
+
+
+def _on_one_core(work: Work) -> list[torch.Tensor]:
+    cores = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return work()
+    finally:
+        torch.set_num_threads(cores)
+
+
+def peak_memory(work: Work, device: torch.device) -> float | None:
+    """MB that `work` takes at most beyond what is taken before and what it returns; None where this cannot be told."""
+    work()
+    gc.collect()
+    if device.type == "cuda":
+        _wait()
+        before = torch.cuda.memory_allocated()
+        torch.cuda.reset_peak_memory_stats()
+        result = work()
+        _wait()
+        return (torch.cuda.max_memory_allocated() - before - sum(part.nbytes for part in result)) / 1e6
+    try:
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL(None).malloc_trim(0)  # what was freed, but kept for later, would hide what is taken anew
+        Path("/proc/self/clear_refs").write_text("5")  # forget the highest mark
+        before = _status("VmRSS")
+        result = work()
+        return (_status("VmHWM") - before - sum(part.nbytes for part in result)) / 1e6
+    except OSError:
+        return None
+
+
+def _status(entry: str) -> int:
+    """Bytes that Linux states of this process."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(entry + ":"):
+            return int(line.split()[1]) * 1024
+    raise OSError(f"/proc/self/status has no {entry}")
+
+
+SECTIONS: dict[str, Callable[[], Iterator[Row]]] = {"ops": ops, "frame": frame, "train": train, "rays": rays}
+
+
+def bench(sections: tuple[str, ...]) -> list[Row]:
+    """Runs benchmarks, with a progress bar on stderr.
+
+    Args:
+        sections: Some of `SECTIONS`; none stands for all.
+
+    Returns:
+        The rows in the order in which they were measured.
+    """
+    rows = []
+    with tqdm(unit=" rows", desc="bench") as progress:
+        for name in sections or SECTIONS:
+            for row in SECTIONS[name]():
+                rows.append(row)
+                progress.set_postfix_str(row.name)
+                progress.update()
+    return rows
+
+
+def table(rows: list[Row]) -> str:
+    """The rows for people."""
+    lines = [("benchmark", "size", "ours", "other", "", "ratio", "largest (mean) difference", "peak")]
+    for r in rows:
+        difference = f"{r.max_abs_diff:.1e} ({r.mean_abs_diff:.0e})"
+        peak = "" if r.peak_mb is None else f"{r.peak_mb:.0f} MB"
+        times = (f"{1e3 * s:.1f} ms" for s in (r.ours_s, r.other_s))
+        lines.append((r.name, r.size, next(times), r.other, next(times), f"{r.ratio:.1f}x", difference, peak))
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    right = (2, 4, 5)
+    return "\n".join(
+        "  ".join(
+            c.rjust(w) if i in right else c.ljust(w) for i, (c, w) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )

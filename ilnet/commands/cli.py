@@ -1,0 +1,393 @@
+"""The command line: `python -m ilnet COMMAND`."""
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+__all__ = ["main"]
+
+_SIZES = "16x1024,64x1024,128x2048,256x4096"
+
+
+class _Size(click.ParamType):
+    """Rows and columns of a range image."""
+
+    name = "ROWSxCOLUMNS"
+
+    def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> tuple[int, int]:
+        """Returns both numbers."""
+        rows, _, columns = str(value).partition("x")
+        if not (rows.isdecimal() and columns.isdecimal() and int(rows) >= 2 and int(columns) >= 2):
+            self.fail(f"{value!r} should be rows x columns, at least 2 of each, such as 128x2048", parameter, context)
+        return int(rows), int(columns)
+
+
+# The commands import what they need themselves, so that `--help` and a typing error answer at once.
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]}, invoke_without_command=True)
+@click.pass_context
+def cli(context: click.Context) -> None:
+    """Implicit LiDAR Network: dense range images from sparse ones."""
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
+
+
+@cli.command()
+@click.option("--mesh", type=Path, metavar="FILE", help="Scan this mesh (metres, z up) instead of the town.")
+@click.option("--at", type=(float, float, float), metavar="X Y Z", help="Position of the sensor in the mesh [m].")
+@click.option("--scan", type=Path, metavar="FILE", help="Decimate this scan, and judge against all of its rows.")
+@click.option("--rows", type=int, metavar="N", help="Beams of the scan to keep; 16 unless told.")
+@click.option("--sensor", metavar="NAME", help="Preset with the scan's angles, where the file does not name them.")
+@click.option("--out", type=Path, default=Path("demo_output"), show_default=True, help="Folder for the pictures.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the table.")
+def demo(
+    mesh: Path | None,
+    at: tuple[float, float, float] | None,
+    scan: Path | None,
+    rows: int | None,
+    sensor: str | None,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Upsample a scan with every method: a table, pictures, a point cloud."""
+    if mesh and scan:
+        raise click.UsageError("--mesh and --scan exclude each other")
+    if bool(mesh) != (at is not None):
+        raise click.UsageError("--mesh FILE and --at X Y Z go together")
+    if not scan and (rows is not None or sensor is not None):
+        raise click.UsageError("--rows and --sensor go with --scan FILE")
+    from ilnet.commands import demo as demonstration
+    from ilnet.learning import evaluate
+
+    if mesh and at:
+        [pair], source = evaluate.mesh_pairs(mesh, [at], demonstration.OUTPUT), mesh.name
+    elif scan:
+        pair, source = evaluate.scan_pair(scan, 16 if rows is None else rows, sensor), scan.name
+    else:
+        pair, source = demonstration.from_town(), demonstration.TOWN
+    result = demonstration.demo(*pair, out, source)
+    if as_json:
+        click.echo(json.dumps(result))
+        return
+    click.echo(f"{source}: {result['input']} -> {result['output']}\n")
+    click.echo(_table(result["methods"]))
+    click.echo(f"\nrange images, 3-D picture and point cloud: {out}/")
+
+
+@cli.command()
+@click.argument("model")
+@click.option("--preset", default="tiny", show_default=True, help="Size of the network and of its training.")
+@click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps, instead of the preset's.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of weights and rays.")
+@click.option("--data", type=Path, metavar="DIR", help="Learn from stored images: an archive or a tree of .rimg files.")
+@click.option("--size", type=_Size(), help="Of the stored images to learn from; 128x2048 unless told.")
+@click.option("--out", type=Path, default=Path("runs"), show_default=True, help="Folder for weights, figures, logs.")
+def train(
+    model: str,
+    preset: str,
+    steps: int | None,
+    seed: int,
+    data: Path | None,
+    size: tuple[int, int] | None,
+    out: Path,
+) -> None:
+    """Train MODEL on rays cast at continuous directions; goes on where an interrupted run in --out stopped.
+
+    `torchrun --nproc-per-node N -m ilnet train MODEL` shares each batch among N processes or GPUs.
+    """
+    from ilnet.learning import train as training
+
+    if size and not data:
+        raise click.UsageError("--size goes with --data DIR")
+    figures = training.train(model, preset, out, steps, seed, data, size or training.TARGET_SIZE)
+    click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
+
+
+@cli.command("evaluate")
+@click.option("--model", "names", multiple=True, required=True, metavar="NAME|FILE", help="May be given repeatedly.")
+@click.option("--scene", metavar="TOWN|MESH", help="Scan this town, or this mesh file (metres, z up).")
+@click.option("--at", type=Path, metavar="FILE", help='Positions in the mesh: {"positions": [[x, y, z], ...]} [m].')
+@click.option("--scan", type=Path, metavar="FILE", help="Decimate this scan, and judge against all of its rows.")
+@click.option("--rows", type=int, metavar="N", help="Beams of the scan to keep; 16 unless told.")
+@click.option("--sensor", metavar="NAME", help="Preset with the scan's angles, where the file does not name them.")
+@click.option("--size", type=_Size(), help="Rays to predict in the scene; 128x2048 unless told.")
+@click.option("--scans", type=click.IntRange(min=1), help="Scans of the scene; 8, or all positions, unless told.")
+@click.option(
+    "--json", "as_json", is_flag=True, help="Print an object instead of the table, or a list for many models."
+)
+def evaluate_(
+    names: tuple[str, ...],
+    scene: str | None,
+    at: Path | None,
+    scan: Path | None,
+    rows: int | None,
+    sensor: str | None,
+    size: tuple[int, int] | None,
+    scans: int | None,
+    as_json: bool,
+) -> None:
+    """Measure models on scans of a scene, seen with 16x1024 rays, or on a measured scan."""
+    if bool(scene) == bool(scan):
+        raise click.UsageError("give --scene TOWN|MESH or --scan FILE")
+    if scan and (at or size or scans):
+        raise click.UsageError("--at, --size and --scans go with --scene; a scan is judged at its own size")
+    if scene and (rows is not None or sensor is not None):
+        raise click.UsageError("--rows and --sensor go with --scan FILE")
+    from ilnet import models
+    from ilnet.learning import evaluate
+    from ilnet.world import meshes, towns
+
+    loaded = {name: models.load(name) for name in names}
+    output = evaluate.INPUT.resize(*(size or (128, 2048)))
+    if scan:
+        pairs = [evaluate.scan_pair(scan, 16 if rows is None else rows, sensor)]
+    elif scene in towns.NAMES:
+        if at:
+            raise click.UsageError("--at goes with a mesh; a town has its own waypoints")
+        pairs = evaluate.town_pairs(scene, scans or 8, output)
+    else:
+        mesh = Path(str(scene))
+        if not mesh.exists():
+            raise click.UsageError(f"--scene {scene} is neither a town ({', '.join(towns.NAMES)}) nor a mesh file")
+        if at is None:
+            raise click.UsageError("--scene MESH needs --at FILE, the positions of the sensor in the mesh")
+        positions = [tuple(position) for position in meshes.read_positions(at).tolist()]
+        if scans and scans > len(positions):
+            raise click.UsageError(f"--scans is {scans}, but {at} holds {len(positions)} positions")
+        pairs = evaluate.mesh_pairs(mesh, positions[:scans], output)
+    results = evaluate.evaluate(loaded, pairs)
+    if as_json:
+        click.echo(json.dumps(results[0] if len(results) == 1 else results))
+        return
+    click.echo(f"{scene or scan}: {len(pairs)} scan(s) -> {results[0]['size']}\n")
+    click.echo(_table({result["model"]: result for result in results}))
+
+
+@cli.command("upsample")
+@click.argument("source", metavar="IN", type=Path)
+@click.argument("out", metavar="OUT", type=Path)
+@click.option("--size", type=_Size(), help="Rays wanted over the same field of view.")
+@click.option("--sensor", metavar="NAME", help="Or the preset whose scan is wanted.")
+@click.option("--model", "name", default="iln-prior", show_default=True, metavar="NAME|FILE")
+@click.option(
+    "--from", "origin", metavar="NAME", help="Preset with the angles of IN, where its files do not name them."
+)
+@click.option("--format", "suffix", type=click.Choice(["npz", "ply", "pcd"]), help="In a folder OUT; npz unless told.")
+@click.pass_context
+def upsample_(
+    context: click.Context,
+    source: Path,
+    out: Path,
+    size: tuple[int, int] | None,
+    sensor: str | None,
+    name: str,
+    origin: str | None,
+    suffix: str | None,
+) -> None:
+    """Make a denser scan of the file IN, or of each file in the folder IN."""
+    if bool(size) == bool(sensor):
+        raise click.UsageError("give --size ROWSxCOLUMNS or --sensor NAME")
+    if suffix and not source.is_dir():
+        raise click.UsageError("--format goes with a folder; the suffix of OUT says the format of one file")
+    from ilnet import models
+    from ilnet.commands import upsample
+    from ilnet.sensor import preset
+
+    target = size or preset(str(sensor))
+    written, failed = upsample.upsample(
+        source, out, models.load(name), target, preset(origin) if origin else None, f".{suffix or 'npz'}"
+    )
+    if written:
+        click.echo(f"{written} scan(s) written to {out}" + (f", {failed} could not be: see above" if failed else ""))
+    if failed:
+        context.exit(2)
+
+
+@cli.command()
+@click.option("--towns", metavar="NAMES", help="Towns, comma separated, with a seed as in town01:7; all unless told.")
+@click.option("--mesh", type=Path, metavar="FILE", help="Scan this mesh (metres, z up) instead of towns.")
+@click.option("--at", type=Path, metavar="JSON", help='Sensor positions in the mesh [m]: {"positions": [[x, y, z]]}.')
+@click.option("--scans", type=click.IntRange(min=1), required=True, metavar="N", help="Poses to scan from, in all.")
+@click.option("--sizes", metavar="HxW", help=f"Of the paper's sensor, comma separated; {_SIZES} unless told.")
+@click.option("--sensor", metavar="NAMES", help="Presets, comma separated, instead of --sizes.")
+@click.option("--effect", "effects", multiple=True, metavar="NAME=VALUE", help="Such as range_noise=0.02.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of waypoints, poses, traffic.")
+@click.option("--shard", metavar="I/N", default="1/1", help="Do part I of N, for many hosts; merge by copying files.")
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes on a CPU; all cores unless told.")
+@click.option("--out", type=Path, required=True, help="Folder of the archive; an interrupted run goes on there.")
+def simulate(
+    towns: str | None,
+    mesh: Path | None,
+    at: Path | None,
+    scans: int,
+    sizes: str | None,
+    sensor: str | None,
+    effects: tuple[str, ...],
+    seed: int,
+    shard: str,
+    workers: int | None,
+    out: Path,
+) -> None:
+    """Simulate scans into a Zarr archive; killed at any moment, the same command goes on."""
+    if bool(mesh) != bool(at):
+        raise click.UsageError("--mesh FILE and --at JSON go together")
+    if mesh and towns:
+        raise click.UsageError("--mesh and --towns exclude each other")
+    if sizes and sensor:
+        raise click.UsageError("--sizes and --sensor exclude each other")
+    part, _, parts = shard.partition("/")
+    if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
+        raise click.UsageError(f"--shard is {shard!r}; it should be I/N with 1 <= I <= N, such as 2/3")
+    from ilnet.data import generate
+    from ilnet.sensor import preset
+    from ilnet.world.towns import NAMES
+
+    if mesh and at:
+        places = generate.mesh_place(mesh, at)
+    else:
+        places = generate.town_places(towns.split(",") if towns else NAMES)
+    if sensor:
+        sensors = [preset(name) for name in sensor.split(",")]
+    else:
+        sensors = generate.sensors_of_sizes((sizes or _SIZES).split(","))
+    try:
+        wanted = generate.effects_of(effects)
+        archive = generate.generate(out, places, scans, sensors, seed, (int(part), int(parts)), workers, wanted)
+    except KeyboardInterrupt:
+        click.echo(f"interrupted: what is complete stays in {out}; the same command goes on from there", err=True)
+        raise
+    left = len(archive.missing())
+    state = f"{left} units of {generate.UNIT} scans are left to other shards" if left else "complete"
+    click.echo(f"{out}: {scans} scans of {', '.join(archive.sizes)}: {state}")
+
+
+@cli.command()
+@click.argument("sections", nargs=-1, type=click.Choice(["ops", "frame", "train", "rays"]))
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON list instead of the table.")
+def bench(sections: tuple[str, ...], as_json: bool) -> None:
+    """Time our ops, frames, training steps and rays beside what one would otherwise write; all unless told."""
+    from ilnet.commands import bench as benchmarks
+
+    rows = benchmarks.bench(sections)
+    click.echo(json.dumps([row.json() for row in rows], indent=1) if as_json else benchmarks.table(rows))
+
+
+@cli.command()
+@click.option(
+    "--scan", "scans", type=Path, multiple=True, metavar="FILE", help="A measured scan that names its angles."
+)
+@click.option("--mesh", "meshes", type=Path, multiple=True, metavar="FILE", help="A mesh (metres, z up).")
+@click.option("--at", type=Path, multiple=True, metavar="JSON", help="Positions in the mesh: one file for each --mesh.")
+@click.option("--town", "towns", multiple=True, metavar="NAME", help="A town, or `all` of them.")
+@click.option("--out", type=Path, default=Path("survey_output"), show_default=True, help="Folder for the figure.")
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON list instead of the table.")
+def survey(
+    scans: tuple[Path, ...],
+    meshes: tuple[Path, ...],
+    at: tuple[Path, ...],
+    towns: tuple[str, ...],
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Compare towns and meshes with measured scans, all seen with the rays of each scan: a table and a figure."""
+    if len(meshes) != len(at):
+        raise click.UsageError("--mesh FILE and --at JSON go together, one each")
+    if not (scans or meshes or towns):
+        raise click.UsageError("give at least one --scan, --mesh or --town")
+    from ilnet.commands import survey as comparison
+    from ilnet.world.towns import NAMES
+
+    entries = comparison.survey(scans, zip(meshes, at, strict=True), NAMES if towns == ("all",) else towns)
+    found = "[\n" + ",\n".join(map(json.dumps, comparison.records(entries))) + "\n]"
+    comparison.draw(entries, out / "survey.png")
+    (out / "survey.json").write_text(found + "\n")
+    click.echo(
+        found if as_json else f"{comparison.table(entries)}\n\nfigure and numbers: {out}/survey.png, survey.json"
+    )
+
+
+@cli.command()
+@click.option(
+    "--town", "names", multiple=True, metavar="NAME", help="Draw this town; may be repeated. All unless told."
+)
+@click.option("--out", type=Path, default=Path("towns_output"), show_default=True, help="Folder for the pictures.")
+def towns(names: tuple[str, ...], out: Path) -> None:
+    """Draw the procedural towns: from above, from the street, and one scan of each."""
+    from ilnet.commands import pictures
+    from ilnet.world.towns import NAMES
+
+    for path in pictures.draw(list(names or NAMES), out):
+        click.echo(path)
+
+
+@cli.command()
+@click.argument(
+    "names", nargs=-1, type=click.Choice(["table", "convergence", "attention", "prior", "rays", "real", "all"])
+)
+@click.option(
+    "--preset", help="Of each training; small unless told, and table and real then take the networks that ship."
+)
+@click.option("--out", type=Path, default=Path("runs/experiments"), show_default=True, help="Folder for all there is.")
+@click.option("--scans", type=click.IntRange(min=1), default=20, show_default=True, help="From each test town.")
+@click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, help="Trainings behind each band.")
+@click.option("--data", type=Path, metavar="DIR", help="Stored images: for LiDAR-SR, and against continuous rays.")
+@click.option("--measured", type=Path, multiple=True, metavar="FILE", help="A measured scan; may be repeated.")
+def experiment(
+    names: tuple[str, ...],
+    preset: str | None,
+    out: Path,
+    scans: int,
+    seeds: int,
+    data: Path | None,
+    measured: tuple[Path, ...],
+) -> None:
+    """Run the paper's experiments and ours: CSV, figures, RESULTS.md. Goes on where it was interrupted."""
+    if not names:
+        raise click.UsageError("name some experiments, or all")
+    from ilnet.commands import experiment as experiments
+
+    chosen = tuple(experiments.EXPERIMENTS) if "all" in names else names
+    for name, option, value in (("rays", "--data DIR", data), ("real", "--measured FILE", measured)):
+        if name in chosen and not value:  # said before hours of training, not after
+            raise click.UsageError(f"{name} needs {option}")
+    study = experiments.Study(preset, out, scans, seeds, data, measured)
+    for name in chosen:
+        experiments.EXPERIMENTS[name](study)
+        click.echo(experiments.results(study))
+
+
+def _table(methods: dict[str, dict[str, Any]]) -> str:
+    columns = {
+        "mae": "MAE [m]",
+        "iou": "IoU",
+        "precision": "precision",
+        "recall": "recall",
+        "f1": "F1",
+        "floating": "floating",
+        "edge_mae": "at edges",
+    }
+    width = max(18, *map(len, methods))
+    lines = [f"{'method':{width}}" + "".join(f"{title:>11}" for title in columns.values())]
+    lines += [f"{name:{width}}" + "".join(f"{figures[c]:11.3f}" for c in columns) for name, figures in methods.items()]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Runs the command line; what a user can mend is one line on stderr and exit code 2."""
+    # Torch's threads would stay awake for milliseconds after each operation, on cores that the next kernel wants.
+    os.environ.setdefault("GOMP_SPINCOUNT", "3000")
+    try:
+        sys.exit(cli.main(prog_name="python -m ilnet", standalone_mode=False))
+    except click.ClickException as error:
+        message = error.format_message()
+    except (click.Abort, KeyboardInterrupt):
+        sys.exit(130)
+    except (ValueError, OSError) as error:
+        message = str(error)
+    click.echo("error: " + " ".join(message.split()), err=True)
+    sys.exit(2)

@@ -1,0 +1,444 @@
+"""The experiments of the paper (Sec. III), and ours: each trains what it needs and writes numbers, a figure and a page.
+
+What is trained stays below the output folder, so that an interrupted experiment goes on where it stopped and several
+share what they have in common. Test scans come from the towns 07 and 10, in which nothing is trained or chosen.
+"""
+
+import csv
+import json
+import math
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from safetensors import safe_open
+
+from ilnet import data, models, scan_files
+from ilnet.commands import plot
+from ilnet.learning import evaluate, train
+from ilnet.world import towns
+
+__all__ = ["EXPERIMENTS", "Study", "results"]
+
+SIZES = ((64, 1024), (128, 2048), (256, 4096))
+# What the paper reports (Table II): MAE [m], IoU, precision, recall, F1 on CARLA's towns 07 and 10.
+PAPER = {
+    "64x1024": {
+        "lidar-sr": (1.560, 0.233, 0.370, 0.377, 0.373),
+        "bilinear": (2.372, 0.202, 0.322, 0.328, 0.325),
+        "liif": (1.558, 0.258, 0.403, 0.409, 0.406),
+        "iln": (1.536, 0.329, 0.483, 0.486, 0.484),
+    },
+    "128x2048": {
+        "lidar-sr": (1.746, 0.161, 0.262, 0.288, 0.274),
+        "bilinear": (2.591, 0.165, 0.268, 0.287, 0.277),
+        "liif": (1.714, 0.236, 0.372, 0.388, 0.379),
+        "iln": (1.690, 0.331, 0.483, 0.498, 0.491),
+    },
+    "256x4096": {
+        "lidar-sr": (1.735, 0.127, 0.207, 0.245, 0.224),
+        "bilinear": (2.646, 0.163, 0.256, 0.303, 0.277),
+        "liif": (1.923, 0.158, 0.221, 0.356, 0.272),
+        "iln": (1.763, 0.232, 0.353, 0.396, 0.373),
+    },
+}
+
+# Told apart by the colour-blind, and in print.
+_SERIES = "#0072b2", "#e69f00", "#009e73", "#cc79a7"
+_COLOURS = {"liif": "#d55e00", "iln": "#0072b2", "iln-prior": "#009e73", "lidar-sr": "#cc79a7", "bilinear": "#999999"}
+
+
+@dataclass(frozen=True)
+class Study:
+    """What experiments share.
+
+    Attributes:
+        preset: Of each training, one of `train.PRESETS`; where None, trainings are `small`, and the networks that ship
+            with the package stand for those that are compared with other methods.
+        out: Folder for weights, numbers, figures.
+        scans: Test scans from each test town.
+        seeds: How often a training is repeated where its spread is shown.
+        archive: Stored images, for the comparison with continuous rays and for LiDAR-SR at those of `SIZES` that it
+            holds; without it these are left out.
+        measured: Files of measured scans.
+    """
+
+    preset: str | None
+    out: Path
+    scans: int = 20
+    seeds: int = 3
+    archive: Path | None = None
+    measured: tuple[Path, ...] = ()
+
+    @cached_property
+    def probe(self) -> list[evaluate.Pair]:
+        """Test scans that are measured in the course of a training."""
+        output = evaluate.INPUT.resize(*SIZES[0])
+        return [pair for town in towns.TEST for pair in evaluate.town_pairs(town, 4, output)]
+
+    def trained(self, label: str, name: str, **options: Any) -> Path:
+        """Trains a network, unless that was done, and returns its file of weights; options are those of `train`."""
+        folder = self.out / "weights" / label
+        file = folder / f"{name}.safetensors"
+        if not file.exists():
+            train.train(name, self.preset or "small", folder, **options)
+        return file
+
+    def followed(self, name: str, seed: int = 0) -> Path:
+        """The same for a network as its preset has it, with test figures in the course of its training."""
+        return self.trained(f"{name}-{seed}", name, seed=seed, probe=self.probe)
+
+    def networks(self) -> dict[str, str | Path]:
+        """The networks that are compared with other methods."""
+        return {name: self.trained(name, name) if self.preset else name for name in ("liif", "iln", "iln-prior")}
+
+    def compare(
+        self, files: Mapping[str, str | Path | models.Model], sizes: Sequence[tuple[int, int]] = ()
+    ) -> list[dict[str, Any]]:
+        """Measures models, by the names their rows shall bear, on the test towns; at all `SIZES` unless told."""
+        loaded = {label: f if isinstance(f, models.Model) else models.load(f) for label, f in files.items()}
+        rows = []
+        for size in sizes or SIZES:
+            output = evaluate.INPUT.resize(*size)
+            pairs = [pair for town in towns.TEST for pair in evaluate.town_pairs(town, self.scans, output)]
+            rows += evaluate.evaluate(loaded, pairs)
+        return rows
+
+    def _steps_of_lidar_sr(self) -> str:
+        files = {size[0]: self.out / "weights" / f"lidar-sr-{size[0]}" / "lidar-sr.safetensors" for size in SIZES}
+        steps = []
+        for rows, file in files.items():
+            if file.exists():
+                with safe_open(file, "pt") as weights:
+                    steps.append(f"{weights.metadata()['steps']} steps for {rows} rows")
+        return ", ".join(steps)
+
+    def write(self, name: str, rows: Sequence[dict[str, Any]]) -> None:
+        """Writes rows of one kind as NAME.csv, and in about.json what they were made with."""
+        self.out.mkdir(parents=True, exist_ok=True)
+        shipped = self.preset is None and name in ("table", "real")
+        trained = f"networks trained with preset {self.preset or 'small'}"
+        networks = "the networks that ship" if shipped else trained
+        if any(row.get("model") == "lidar-sr" for row in rows):
+            networks += f"; LiDAR-SR trained with preset {self.preset or 'small'}, {self._steps_of_lidar_sr()}"
+        about = _about(self.out) | {name: {"networks": networks}}
+        (self.out / "about.json").write_text(json.dumps(about, indent=1) + "\n")
+        with open(self.out / f"{name}.csv", "w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(
+                {key: round(v, 4) if isinstance(v, float) else v for key, v in row.items()} for row in rows
+            )
+
+
+def table(study: Study) -> None:
+    """The paper's Table II: all methods at three sizes."""
+    rules: dict[str, str | Path] = {name: name for name in ("nearest", "bilinear", "bilinear-inverse", "planes")}
+    networks = study.networks()
+    stored = data.open_archive(study.archive).sensors if study.archive else {}
+    methods, rows = {}, []
+    for size in SIZES:
+        lidar_sr = {}
+        if f"{size[0]}x{size[1]}" in stored:
+            file = study.trained(f"lidar-sr-{size[0]}", "lidar-sr", archive=study.archive, target=size)
+            lidar_sr = {"lidar-sr": file}
+        methods[size] = rules | lidar_sr | networks
+        rows += study.compare(methods[size], [size])
+    study.write("table", rows)
+    figure = Figure(figsize=(10, 3.2), layout="constrained")
+    for axis, (name, paper) in zip(figure.subplots(1, len(SIZES), sharey=True), PAPER.items(), strict=True):
+        found = {row["model"]: row["iou"] for row in rows if row["size"] == name}
+        axis.bar(list(found), list(found.values()), color=[_COLOURS.get(name, "#cccccc") for name in found])
+        theirs = {model: figures[1] for model, figures in paper.items() if model in found}
+        axis.plot(list(theirs), list(theirs.values()), "k_", markersize=18, label="the paper, on CARLA")
+        axis.set_title(name)
+        axis.tick_params("x", rotation=60, labelsize=8)
+    axis.legend(fontsize=8)
+    figure.axes[0].set_ylabel("IoU")
+    figure.savefig(study.out / "table.png", dpi=120)
+    _draw_points(study, SIZES[1], methods[SIZES[1]])
+
+
+def _draw_points(study: Study, size: tuple[int, int], files: Mapping[str, str | Path]) -> None:
+    """The same crop of a test scan by every method, as points."""
+    for town in towns.TEST:
+        [(sparse, dense)] = evaluate.town_pairs(town, 1, evaluate.INPUT.resize(*size))
+        shown = {"input": sparse}
+        shown |= {name: models.load(file).upsample(sparse, dense.sensor) for name, file in files.items()}
+        plot.point_clouds({**shown, "truth": dense}, study.out / f"points-{town}.png", reach=20.0)
+
+
+def convergence(study: Study) -> None:
+    """The paper's figure of convergence: test figures in the course of training, over several seeds."""
+    rows: list[dict[str, Any]] = []
+    for name in ("liif", "iln"):
+        for seed in range(study.seeds):
+            folder = study.followed(name, seed).parent
+            rows += [{"model": name, "seed": seed, **row} for row in _probed(folder / name)]
+    study.write("convergence", rows)
+    figure = Figure(figsize=(10, 3.2), layout="constrained")
+    for axis, (x, y) in zip(figure.subplots(1, 3), (("step", "iou"), ("seconds", "iou"), ("step", "mae")), strict=True):
+        for name in ("liif", "iln"):
+            runs = [{r["step"]: r for r in rows if r["model"] == name and r["seed"] == s} for s in range(study.seeds)]
+            steps = sorted(set.intersection(*(set(run) for run in runs)))
+            values = np.array([[run[step][y] for step in steps] for run in runs])
+            at = np.mean([[run[step][x] for step in steps] for run in runs], axis=0)
+            at = at / 60 if x == "seconds" else at
+            axis.plot(at, values.mean(0), {"liif": "--", "iln": "-"}[name], color=_COLOURS[name], label=name)
+            axis.fill_between(at, values.min(0), values.max(0), color=_COLOURS[name], alpha=0.25, linewidth=0)
+        axis.set_xlabel({"step": "step", "seconds": "minutes"}[x])
+        axis.set_ylabel({"iou": "IoU", "mae": "MAE [m]"}[y])
+    axis.set_yscale("log")
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter("{x:g}")
+    axis.legend()
+    figure.savefig(study.out / "convergence.png", dpi=120)
+
+
+def _probed(folder: Path) -> list[dict[str, Any]]:
+    """The test figures that a training logged, each step once, though it was interrupted.
+
+    Its `seconds` are those of its median pace, validations included, so that halts and other work of the machine do
+    not count.
+    """
+    found: dict[int, dict[str, Any]] = {}
+    for log in folder.glob("from-step-*/metrics.csv"):
+        with open(log, newline="") as file:
+            for row in csv.DictReader(file):
+                if row.get("test/iou"):
+                    step = int(row["step"]) + 1
+                    figures = {key: float(row[f"test/{key}"]) for key in ("mae", "iou", "floating")}
+                    found.setdefault(step, {"step": step, "seconds": float(row["seconds"]), **figures})
+    steps = sorted(found)
+    passed = np.diff([0.0] + [found[step]["seconds"] for step in steps])
+    pace = float(np.median(passed / np.diff([0, *steps])))
+    return [found[step] | {"seconds": step * pace} for step in steps]
+
+
+def steps_to_reach(rows: Sequence[dict[str, Any]], share: float = 0.1) -> dict[str, float]:
+    """How many more steps LIIF takes to the IoU that ILN has after a share of its budget, means over seeds.
+
+    Returns:
+        `iou` that ILN has then, its `iln_steps`, `liif_steps` (infinite where LIIF never gets there), their `ratio`.
+    """
+    curves: dict[str, dict[int, float]] = {}
+    for name in ("liif", "iln"):
+        at: dict[int, list[float]] = {}
+        for row in rows:
+            if row["model"] == name:
+                at.setdefault(int(row["step"]), []).append(float(row["iou"]))
+        curves[name] = {step: float(np.mean(at[step])) for step in sorted(at)}
+    iln_steps = min(step for step in curves["iln"] if step >= share * max(curves["iln"]))
+    iou = curves["iln"][iln_steps]
+    liif_steps = min((step for step, value in curves["liif"].items() if value >= iou), default=math.inf)
+    return {"iou": iou, "iln_steps": iln_steps, "liif_steps": liif_steps, "ratio": liif_steps / iln_steps}
+
+
+def attention(study: Study) -> None:
+    """The paper's ablation of the number D of attention blocks."""
+    rows = []
+    for depth in (0, 1, 2, 4):
+        file = study.followed("iln") if depth == 1 else study.trained(f"iln-d{depth}", "iln", depth=depth)
+        model = models.load(file)
+        seconds = _frame_time(model)
+        parameters = sum(weight.numel() for weight in model.parameters())
+        for row in study.compare({"iln": file}):
+            rows.append({"depth": depth, "parameters": parameters, "seconds_128x2048": seconds, **row})
+    study.write("attention", rows)
+    _bars(study, "attention", rows, "depth", "attention blocks D")
+
+
+def _frame_time(model: models.Model) -> float:
+    [(scan, truth)] = evaluate.town_pairs(towns.TEST[0], 1, evaluate.INPUT.resize(*SIZES[1]))
+    frames = models.Upsampler(model, scan.sensor, truth.sensor, device=scan.ranges.device)
+    seconds = []
+    for _ in range(4):
+        start = time.perf_counter()
+        frames.ranges(scan).cpu()
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)
+
+
+def prior(study: Study) -> None:
+    """Ours: a geometric prior on the weights, and answers that snap to planes."""
+    files: dict[str, models.Model] = {}
+    usual = models.create("iln-prior")
+    assert isinstance(usual, models.ILN)
+    for kind in ("none", "bilinear", "perspective", "planes"):
+        if kind == "none":
+            file = study.followed("iln")
+        elif kind == usual.prior:
+            file = study.followed("iln-prior")
+        else:
+            file = study.trained(f"iln-{kind}", "iln-prior", prior=kind)
+        for snap in (0.0, usual.snap):
+            model = models.load(file)
+            assert isinstance(model, models.ILN)
+            model.snap = snap
+            files[kind + (", snapped" if snap else "")] = model
+    rows = [{"prior": row.pop("model"), **row} for row in study.compare(files)]
+    study.write("prior", rows)
+    _bars(study, "prior", rows, "prior", "prior")
+
+
+def rays(study: Study) -> None:
+    """Ours: the same budget on stored images, as in the paper, and on rays at continuous directions."""
+    if study.archive is None:
+        raise ValueError(
+            f"stored images are missing: make some with `python -m ilnet simulate --towns {','.join(towns.TRAIN)} "
+            "--scans 2000 --sizes 16x1024,64x1024,128x2048 --out DIR`, and name them with --data DIR"
+        )
+    rows = []
+    for learns_from, archive in (("continuous", None), ("stored", study.archive)):
+        for name in ("iln", "iln-prior"):
+            file = study.trained(f"{name}-stored", name, archive=archive) if archive else study.followed(name)
+            rows += [{"rays": learns_from, **row} for row in study.compare({name: file})]
+    study.write("rays", rows)
+    _bars(study, "rays", [row for row in rows if row["model"] == "iln"], "rays", "learned from (iln)")
+
+
+def _bars(study: Study, name: str, rows: Sequence[dict[str, Any]], by: str, title: str) -> None:
+    """Draws IoU and MAE by size; kinds that differ behind a comma only share a colour."""
+    figure = Figure(figsize=(9, 3), layout="constrained")
+    for axis, (key, words) in zip(figure.subplots(1, 2), (("iou", "IoU"), ("mae", "MAE [m]")), strict=True):
+        kinds = list(dict.fromkeys(str(row[by]) for row in rows))
+        colours = dict(zip(dict.fromkeys(kind.partition(",")[0] for kind in kinds), _SERIES, strict=False))
+        for number, kind in enumerate(kinds):
+            chosen = [row for row in rows if str(row[by]) == kind]
+            at = np.arange(len(chosen)) + (number - (len(kinds) - 1) / 2) * 0.8 / len(kinds)
+            first, comma, _ = kind.partition(",")
+            look = {"color": colours[first], "hatch": "////" if comma else None, "edgecolor": "white", "linewidth": 0}
+            axis.bar(at, [row[key] for row in chosen], 0.8 / len(kinds), label=kind, **look)
+        axis.set_xticks(range(len(chosen)), [row["size"] for row in chosen])
+        axis.set_ylabel(words)
+    axis.legend(title=title, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+    figure.savefig(study.out / f"{name}.png", dpi=120)
+
+
+def real(study: Study) -> None:
+    """Ours: measured scans, of which the networks saw none; some beams are kept, all are predicted."""
+    if not study.measured:
+        raise ValueError("no measured scans are named: give some with --measured FILE, such as frames of your sensor")
+    files: dict[str, str | Path] = {name: name for name in ("bilinear", "bilinear-inverse", "planes")}
+    files |= study.networks()
+    loaded = {label: models.load(file) for label, file in files.items()}
+    rows = []
+    for path in study.measured:
+        beams = scan_files.read(path).sensor.shape[0]
+        for kept in [count for count in (8, 16, 32) if beams // 16 <= count < beams][-2:]:
+            pair = evaluate.scan_pair(path, kept)
+            rows += [{"scan": path.stem, "beams": kept, **row} for row in evaluate.evaluate(loaded, [pair])]
+    study.write("real", rows)
+    figure = Figure(figsize=(10, 3.4), layout="constrained")
+    axis = figure.subplots()
+    cases = list(dict.fromkeys((row["scan"], row["beams"]) for row in rows))
+    for number, name in enumerate(files):
+        values = [next(r["iou"] for r in rows if (r["scan"], r["beams"]) == c and r["model"] == name) for c in cases]
+        axis.bar(
+            np.arange(len(cases)) + 0.16 * (number - 2), values, 0.16, label=name, color=_COLOURS.get(name, "#555555")
+        )
+    axis.set_xticks(range(len(cases)), [f"{scan}\n{kept} beams" for scan, kept in cases], fontsize=6)
+    axis.set_ylabel("IoU")
+    axis.legend(fontsize=8)
+    figure.savefig(study.out / "real.png", dpi=120)
+
+
+EXPERIMENTS: dict[str, Callable[[Study], None]] = {
+    "table": table,
+    "convergence": convergence,
+    "attention": attention,
+    "prior": prior,
+    "rays": rays,
+    "real": real,
+}
+
+
+def results(study: Study) -> Path:
+    """Writes RESULTS.md: all that experiments left in the folder so far, as tables and figures."""
+    about = _about(study.out)
+    done = {name: _read(study.out / f"{name}.csv") for name in EXPERIMENTS if name in about}
+    lines = ["# Results", "", "Ratios of figures on the test towns, and of IoU on measured scans:", ""]
+    lines += _markdown(ratios(done))
+    for name, rows in done.items():
+        lines += ["", f"## {name}", "", (EXPERIMENTS[name].__doc__ or "").strip(), ""]
+        lines += [f"Made with {about[name]['networks']}.", "", f"![{name}]({name}.png)", ""]
+        lines += _markdown(_shown(name, rows))
+        if name == "table":
+            lines += ["", *(f"![The same crop by every method, {town}](points-{town}.png)" for town in towns.TEST)]
+    page = study.out / "RESULTS.md"
+    page.write_text("\n".join(lines).rstrip() + "\n")
+    return page
+
+
+def ratios(done: Mapping[str, Sequence[dict[str, Any]]]) -> list[dict[str, str]]:
+    """What the experiments are about: one row for each ratio, with the paper's beside ours.
+
+    Args:
+        done: Rows of the experiments `table`, `convergence` and `real`, by name, as far as they were run.
+    """
+    found: list[dict[str, str]] = []
+
+    def add(figure: str, one: dict[str, Any], other: dict[str, Any], key: str, paper: float | None = None) -> None:
+        ours = f"{float(one[key]) / float(other[key]):.2f}" if float(other[key]) else "over 0"
+        found.append({"figure": figure, "the paper": f"{paper:.2f}" if paper else "", "ours": ours})
+
+    table = {(row["model"], row["size"]): row for row in done.get("table", ())}
+    for key, words in (("iou", "IoU"), ("mae", "MAE")):
+        column = {"mae": 0, "iou": 1}[key]
+        for one, other in (("iln", "liif"), ("iln", "bilinear"), ("iln-prior", "bilinear"), ("iln-prior", "iln")):
+            for size, paper in PAPER.items():
+                if {(one, size), (other, size)} <= table.keys():
+                    theirs = paper[one][column] / paper[other][column] if {one, other} <= paper.keys() else None
+                    add(f"{words} of {one} over {other}, {size}", table[one, size], table[other, size], key, theirs)
+    if "convergence" in done:
+        reached = steps_to_reach(done["convergence"])
+        figure = f"steps of liif to the IoU {reached['iou']:.3f} that iln has after {reached['iln_steps']}, over those"
+        ours = "never in its budget" if math.isinf(reached["ratio"]) else f"{reached['ratio']:.1f}"
+        found.append({"figure": figure, "the paper": "much more", "ours": ours})
+    real = {(row["model"], row["scan"], row["beams"], row["size"]): row for row in done.get("real", ())}
+    for model, *case in real:
+        if model == "iln-prior":
+            figure = f"IoU of iln-prior over bilinear, {case[0]}, {case[1]} beams -> {case[2]}"
+            add(figure, real[model, *case], real["bilinear", *case], "iou")
+    return found
+
+
+def _about(folder: Path) -> dict[str, Any]:
+    file = folder / "about.json"
+    return dict(json.loads(file.read_text())) if file.exists() else {}
+
+
+def _read(file: Path) -> list[dict[str, Any]]:
+    with open(file, newline="") as text:
+        return list(csv.DictReader(text))
+
+
+def _shown(name: str, rows: Sequence[dict[str, Any]]) -> Sequence[dict[str, Any]]:
+    """The rows that the page shows of an experiment: of a convergence where it ends."""
+    if name == "convergence":
+        last = max(int(row["step"]) for row in rows)
+        return [row for row in rows if int(row["step"]) == last]
+    return _beside_the_paper(rows) if name == "table" else rows
+
+
+def _beside_the_paper(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows with the paper's MAE and IoU where it has some."""
+    found = []
+    for row in rows:
+        theirs = PAPER[row["size"]].get(row["model"])
+        found.append({**row, "mae, paper": theirs[0] if theirs else "", "iou, paper": theirs[1] if theirs else ""})
+    return found
+
+
+def _markdown(rows: Sequence[dict[str, Any]]) -> list[str]:
+    if not rows:
+        return []
+    head = list(rows[0])
+    return [
+        "| " + " | ".join(map(str, line)) + " |" for line in (head, ["---"] * len(head), *(r.values() for r in rows))
+    ]

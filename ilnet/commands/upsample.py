@@ -1,0 +1,85 @@
+"""Files of scans in, files of denser scans out."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from tqdm import tqdm  # type: ignore[import-untyped]
+
+from ilnet import models, scan_files
+from ilnet.scan import Scan
+from ilnet.sensor import Sensor
+from ilnet.world import simulate
+
+__all__ = ["upsample"]
+
+
+def upsample(
+    source: Path,
+    out: Path,
+    model: models.Model,
+    target: Sensor | tuple[int, int],
+    sensor: Sensor | None = None,
+    suffix: str = ".npz",
+) -> tuple[int, int]:
+    """Upsamples a file, or all files of a folder, with a progress bar on stderr.
+
+    A file that cannot be upsampled is one line on stderr and does not keep the others from it. Each file is written
+    whole or not at all.
+
+    Args:
+        source: A file that `ilnet.scan_files.read` reads, or a folder of them; folders and hidden files in it are
+            left out.
+        out: The file to write, in a format of `ilnet.scan_files.write`, or where `source` is a folder the folder to
+            write to, made where missing.
+        model: What predicts.
+        target: The sensor whose scan is wanted, or its rows and columns over the field of view of each file's sensor.
+        sensor: The sensor of the files, where they do not name theirs; see `ilnet.scan_files.read`.
+        suffix: Of the files written to a folder.
+
+    Returns:
+        How many files were written, and how many could not be.
+
+    Raises:
+        OSError: If `source` is missing or `out` cannot be made.
+        ValueError: If there is nothing to upsample, or it would be overwritten.
+    """
+    device = simulate.best_device()
+    model = model.to(device)
+    frames: models.Upsampler | None = None
+    tasks = list(_tasks(source, out, suffix))
+    written: set[Path] = set()
+    failed = 0
+    for path, result in tqdm(tasks, unit="scan", desc="upsample"):
+        try:
+            if result in written:
+                raise ValueError(f"{path}: another file of this name became {result} already; rename one")
+            scan = scan_files.read(path, sensor)
+            scan = Scan(scan.ranges.to(device), scan.sensor)
+            if frames is None or frames.source != scan.sensor:
+                wanted = target if isinstance(target, Sensor) else scan.sensor.resize(*target)
+                frames = models.Upsampler(model, scan.sensor, wanted, device=device)
+            scan_files.write(result, frames(scan))
+            written.add(result)
+        except (ValueError, OSError) as error:
+            failed += 1
+            line = " ".join(str(error).split())
+            tqdm.write(f"error: {line if line.startswith(str(path)) else f'{path}: {line}'}", file=sys.stderr)
+    return len(written), failed
+
+
+def _tasks(source: Path, out: Path, suffix: str) -> Iterator[tuple[Path, Path]]:
+    """Which file becomes which."""
+    if not source.is_dir():
+        if out.exists() and out.samefile(source):
+            raise ValueError(f"{out} is the file to be read; give the result another name")
+        yield source, out
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    if out.samefile(source):
+        raise ValueError(f"{out} is the folder to be read; give the results another one")
+    paths = sorted(path for path in source.iterdir() if path.is_file() and not path.name.startswith("."))
+    if not paths:
+        raise ValueError(f"{source}: there is no file in this folder")
+    for path in paths:
+        yield path, out / f"{path.stem}{suffix}"

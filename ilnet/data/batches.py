@@ -1,0 +1,224 @@
+"""Training data: images stored on disk, and rays at continuous directions, cast while the network trains.
+
+The paper trains on the former and calls the latter intractable (Sec. III-A).
+"""
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch.utils.data import IterableDataset, get_worker_info
+
+from ilnet.data.archive import Archive
+from ilnet.data.rimg import RangeImageTree
+from ilnet.sensor import Sensor, angles_to_directions
+from ilnet.world import simulate, towns
+from ilnet.world.places import SENSOR_HEIGHT, Street
+from kernels import Mesh
+
+__all__ = ["Batch", "ContinuousRays", "StoredImages"]
+
+# Metres by which the height of the sensor varies from car to car.
+_HEIGHT_JITTER = 0.3
+# Radians: a car pitches and rolls.
+_TILT_JITTER = math.radians(2.0)
+# Columns at a crop's sides that no query falls into: there the network sees a border no full circle has.
+_MARGIN = 8
+
+
+class Batch(NamedTuple):
+    """Crops of scans, and what a laser would have measured between their pixels."""
+
+    image: torch.Tensor
+    """(B, H, W) metres, no return filled with `norm_range`."""
+    queries: torch.Tensor
+    """(B, Q, 2) pixel coordinates."""
+    ranges: torch.Tensor
+    """(B, Q) metres along the queries, no return filled with `norm_range`."""
+    wrap: bool
+    """Whether the images go full circle."""
+
+
+class ContinuousRays(IterableDataset):
+    """Endless batches of crops and of rays at random directions between their pixels.
+
+    Each crop has a street, a waypoint, a height, a yaw, a tilt and traffic of its own. A query's direction is uniform
+    in elevation and azimuth: no stored image contains it. Rays are cast when a batch is asked for, where the streets
+    are: on a GPU, or on the CPU, where the workers of a `DataLoader` take turns. The batches are the same for any
+    number of workers.
+
+    Args:
+        streets: Where scans are taken; each is drawn equally often.
+        sensor: The input sensor.
+        crops: Crops B in a batch.
+        columns: Columns W of a crop.
+        queries: Rays Q per crop.
+        seed: Of the random numbers; seed and number of a batch decide what it holds.
+        start: Number of the first batch, for a training that goes on.
+        part: (number, of how many) equal parts of each batch to cast, for training in several processes.
+    """
+
+    def __init__(
+        self,
+        streets: list[Street],
+        sensor: Sensor,
+        crops: int,
+        columns: int,
+        queries: int,
+        seed: int,
+        start: int = 0,
+        part: tuple[int, int] = (0, 1),
+    ):
+        self.streets, self.crops, self.queries, self.seed, self.start = streets, crops, queries, seed, start
+        self.sensor = replace(sensor, azimuths=sensor.azimuths[:columns], name=f"{sensor.name} crop")
+        self.part = _part(crops, part)
+
+    def __iter__(self) -> Iterator[Batch]:
+        return map(self._draw, _numbers(self.start))
+
+    def _draw(self, number: int) -> Batch:
+        generator = _generator(self.seed, number)
+
+        def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
+            return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+        crops, sensor = self.crops, self.sensor
+        elevation = uniform(*sensor.elevations[[0, -1]], crops, self.queries)[self.part]
+        azimuth = uniform(*sensor.azimuths[[_MARGIN, -1 - _MARGIN]], crops, self.queries)[self.part]
+        grid = sensor.directions().double().view(1, -1, 3).expand(len(azimuth), -1, -1)
+        rays = torch.cat((grid, angles_to_directions(elevation, azimuth)), 1)
+        town = torch.randint(len(self.streets), (crops,), generator=generator)
+        along = uniform(0, 1, crops)
+        at = torch.stack([self._waypoint(*place) for place in zip(town.tolist(), along.tolist(), strict=True)])
+        at[:, 2] += SENSOR_HEIGHT + uniform(-_HEIGHT_JITTER, _HEIGHT_JITTER, crops)
+        turn, tilt = uniform(-math.pi, math.pi, crops), uniform(-_TILT_JITTER, _TILT_JITTER, 2, crops)
+        town, pose = town[self.part], simulate.pose(at, turn, *tilt)[self.part]
+        ranges = self._cast_traffic(town, pose, rays, number)
+        for which in town.unique().tolist():
+            chosen = town == which
+            standing = simulate.cast(self.streets[which].mesh, pose[chosen], rays[chosen], sensor.max_range)
+            ranges[chosen] = simulate.nearest([standing, ranges[chosen]])
+        ranges = ranges.where(ranges >= max(sensor.min_range, 1e-9), sensor.norm_range).cpu()
+        image, ranges = ranges.split([grid.shape[1], self.queries], 1)
+        return Batch(image.unflatten(1, sensor.shape), sensor.locate(elevation, azimuth), ranges.contiguous(), False)
+
+    def _waypoint(self, town: int, along: float) -> torch.Tensor:
+        waypoints = self.streets[town].town.waypoints
+        return torch.from_numpy(waypoints[int(along * len(waypoints))]).double()
+
+    def _cast_traffic(self, town: torch.Tensor, pose: torch.Tensor, rays: torch.Tensor, number: int) -> torch.Tensor:
+        """Ranges (B, N) to the vehicles and people of each crop; 0 where none is met.
+
+        They are one mesh, in which the crops stand so far apart that none sees another's.
+        """
+        apart = torch.zeros(len(town), 3, dtype=torch.float64)
+        apart[:, 0] = torch.arange(len(town)) * 4 * self.sensor.max_range
+        first, last = self.sensor.azimuths[[0, -1]]
+        middle = angles_to_directions(torch.tensor(0.0), torch.tensor((first + last) / 2)).double()
+        half = abs(last - first) / 2 + _TILT_JITTER
+        corners = [torch.empty(0, 3)]
+        for crop, which in enumerate(town.tolist()):
+            position, ahead = pose[crop, :3, 3].numpy(), pose[crop, :3, :3] @ middle
+            sector = math.atan2(ahead[1], ahead[0]), half
+            seed = self.seed, number, self.part.start + crop
+            vertices, triangles = towns.traffic(self.streets[which].town, position, seed, sector=sector)
+            moved = (vertices - position + apart[crop].numpy()).astype(np.float32)
+            corners.append(torch.from_numpy(moved[triangles.ravel()]))
+        joined = torch.cat(corners)
+        device = self.streets[0].mesh.device
+        if len(joined) == 0:
+            return torch.zeros(rays.shape[:2], device=device)
+        mesh = Mesh(joined, torch.arange(len(joined)).view(-1, 3), device)
+        pose = pose.clone()
+        pose[:, :3, 3] = apart
+        return simulate.cast(mesh, pose, rays, self.sensor.max_range)
+
+
+class StoredImages(IterableDataset):
+    """Endless batches of stored scans and of pixels of denser images from the same places (paper, Sec. III-A).
+
+    Args:
+        archive: See `open_archive`.
+        source: Size of the input, such as "16x1024".
+        target: Size of the images that the pixels are taken from, such as "128x2048".
+        scans: Scans B in a batch; in the course of an epoch each scan of the archive is drawn once.
+        queries: Pixels Q per scan, all different.
+        seed: Of the random numbers; seed and number of a batch decide what it holds.
+        start: Number of the first batch, for a training that goes on.
+        part: (number, of how many) equal parts of each batch to read, for training in several processes.
+        sector: Columns of the input to give, from one drawn at random on; all unless told. For models whose columns
+            do not meet at the seam: `wrap` remains the sensor's, since pixels are spaced as on the full circle.
+
+    Raises:
+        ValueError: If the archive lacks a size, its images hold fewer pixels than `queries`, or their columns are no
+            multiple of those of the input of which a sector is wanted.
+    """
+
+    def __init__(
+        self,
+        archive: Archive | RangeImageTree,
+        source: str,
+        target: str,
+        scans: int,
+        queries: int,
+        seed: int,
+        start: int = 0,
+        part: tuple[int, int] = (0, 1),
+        sector: int | None = None,
+    ):
+        for size in (source, target):
+            if size not in archive.sensors:
+                raise ValueError(f"{archive.path}: holds no scans of size {size}; it has {', '.join(archive.sizes)}")
+        sensor, dense = archive.sensors[source], archive.sensors[target]
+        self.times, rest = divmod(dense.shape[1], sensor.shape[1])
+        if sector is not None and rest:
+            raise ValueError(f"columns of {target} are no multiple of those of {source}, of which a sector is wanted")
+        located = sensor.grid_queries(dense)[:, : None if sector is None else sector * self.times]
+        if queries > (pixels := located[..., 0].numel()):
+            raise ValueError(f"queries is {queries}; images of {target} have {pixels} pixels")
+        self.archive, self.source, self.target, self.scans, self.queries = archive, source, target, scans, queries
+        self.seed, self.start, self.part, self.wrap = seed, start, _part(scans, part), sensor.wrap
+        self.sector, self.located = sector, located.reshape(-1, 2)
+
+    def __iter__(self) -> Iterator[Batch]:
+        return map(self._read, _numbers(self.start))
+
+    def _read(self, number: int) -> Batch:
+        images, queries, ranges = [], [], []
+        for place in range(number * self.scans, (number + 1) * self.scans)[self.part]:
+            epoch, place_in_epoch = divmod(place, len(self.archive))
+            order = torch.randperm(len(self.archive), generator=_generator(self.seed, 0, epoch))
+            scan = int(order[place_in_epoch])
+            pixels = torch.randperm(len(self.located), generator=_generator(self.seed, 1, place))[: self.queries]
+            sparse, dense = (self.archive.scan(scan, size).filled() for size in (self.source, self.target))
+            if self.sector is not None:
+                first = int(torch.randint(sparse.shape[1], (), generator=_generator(self.seed, 2, place)))
+                sparse = sparse.roll(-first, 1)[:, : self.sector]
+                dense = dense.roll(-first * self.times, 1)[:, : self.sector * self.times]
+            images.append(sparse)
+            queries.append(self.located[pixels])
+            ranges.append(dense.reshape(-1)[pixels])
+        return Batch(torch.stack(images), torch.stack(queries), torch.stack(ranges), self.wrap)
+
+
+def _part(batch: int, part: tuple[int, int]) -> slice:
+    number, parts = part
+    if batch % parts:
+        raise ValueError(f"a batch of {batch} cannot be shared out evenly among {parts} processes")
+    return slice(number * batch // parts, (number + 1) * batch // parts)
+
+
+def _numbers(start: int) -> Iterator[int]:
+    """Numbers of batches; the workers of a `DataLoader` take turns."""
+    worker = get_worker_info()
+    first, step = (worker.id, worker.num_workers) if worker else (0, 1)
+    return itertools.count(start + first, step)
+
+
+def _generator(*seed: int) -> torch.Generator:
+    state = np.random.SeedSequence(seed).generate_state(1, np.uint64)
+    return torch.Generator().manual_seed(int(state[0] >> 1))

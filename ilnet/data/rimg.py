@@ -1,0 +1,137 @@
+"""The `.rimg` files of the paper's authors, in the folders of their download.
+
+`Town01/64_1024/7.rimg` is scan 7 of a town with 64 rows and 1024 columns: two uint64, rows and columns, then float16
+metres, column by column. `lidar_specification.yaml` beside or above the towns tells the field of view [degrees] and the
+range limits [m] of all sizes. Row i looks along elevation v, evenly from `min_v` to `max_v`; column j along an angle h,
+evenly from `min_h` to just short of `max_h`, which their frame counts clockwise from its y axis:
+
+    x = sin h cos v · r,  y = cos h cos v · r,  z = sin v · r
+
+In the frame of `ilnet.sensor` that is azimuth = π/2 - h, with which points have the same coordinates in both.
+"""
+
+import math
+import re
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ilnet.scan import Scan
+from ilnet.sensor import Sensor
+
+__all__ = ["RangeImageTree"]
+
+_SPECIFICATION = "lidar_specification.yaml"
+_KEYS = ("min_v", "max_v", "min_h", "max_h", "min_r", "max_r", "norm_r")
+_NAME = re.compile(r"\d+_\d+/\d+\.rimg")
+_HEADER = 16
+
+
+class RangeImageTree:
+    """The scans of a tree of `.rimg` files, read like an `ilnet.data.archive.Archive`: by town, then by number.
+
+    Args:
+        path: The folder that holds the towns, or that of one town.
+
+    Attributes:
+        path: The folder.
+        sizes: Such as "64x1024", of all towns.
+        sensors: For each size the sensor.
+        towns: The towns' names.
+
+    Raises:
+        OSError: If there is no tree, or it lacks its `lidar_specification.yaml`.
+        ValueError: If that is damaged.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        # A town, towns, or a folder that holds the whole download.
+        files = (file for above in ("", "*/", "*/*/") for file in self.path.glob(f"{above}*_*/*.rimg"))
+        found = [file for file in files if _NAME.fullmatch("/".join(file.parts[-2:]))]
+        if not found:
+            raise FileNotFoundError(f"{path}: holds no scans named like Town01/64_1024/1.rimg")
+        folders = {file.parent.parent for file in found}
+        towns = {f: f.relative_to(self.path).as_posix() if f != self.path else f.resolve().name for f in folders}
+        self.towns = tuple(sorted(towns.values()))
+        self._scans = sorted({(towns[file.parent.parent], int(file.stem), file.parent.parent) for file in found})
+        shapes = {tuple(map(int, file.parent.name.split("_"))) for file in found}
+        self.sensors = {f"{h}x{w}": self._specified(h, w) for h, w in sorted(shapes)}
+        self.sizes = tuple(self.sensors)
+
+    @cached_property
+    def _specification(self) -> dict[str, float]:
+        town = self._scans[0][2].absolute()
+        file = next((f for f in (folder / _SPECIFICATION for folder in town.parents) if f.is_file()), None)
+        if file is None:
+            raise FileNotFoundError(
+                f"{self.path}: there is no {_SPECIFICATION} beside or above its towns; copy it there from the download"
+            )
+        lines = (line.partition("#")[0].partition(":") for line in file.read_text(errors="replace").splitlines())
+        try:
+            values = {key.strip(): float(value) for key, colon, value in lines if colon}
+        except ValueError as error:
+            raise ValueError(f"{file}: should be lines like 'max_r: 80.0', but {error}") from None
+        if absent := [key for key in _KEYS if key not in values]:
+            raise ValueError(f"{file}: lacks {', '.join(absent)}; copy it from the download")
+        return values
+
+    def _specified(self, rows: int, columns: int) -> Sensor:
+        of = self._specification
+        elevations = np.deg2rad(np.linspace(of["min_v"], of["max_v"], rows))
+        azimuths = math.pi / 2 - np.deg2rad(np.linspace(of["min_h"], of["max_h"], columns, endpoint=False))
+        try:
+            return Sensor(elevations, azimuths, of["min_r"], of["max_r"], of["norm_r"])
+        except ValueError as error:
+            raise ValueError(
+                f"{self.path}: its {_SPECIFICATION} makes no sensor of {rows}x{columns}: {error}"
+            ) from None
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def scan(self, number: int, size: str) -> Scan:
+        """Returns a scan; no return, for which some of the authors' tools store a long range, is 0.
+
+        Raises:
+            IndexError: If there are fewer scans.
+            OSError: If there is no such size of this scan.
+            ValueError: If the file is cut short or damaged.
+        """
+        if size not in self.sensors:
+            raise ValueError(f"{self.path}: holds no scans of size {size!r}; it has {', '.join(self.sizes)}")
+        _, index, folder = self._numbered(number)
+        sensor = self.sensors[size]
+        rows, columns = sensor.shape
+        file = folder / f"{rows}_{columns}" / f"{index}.rimg"
+        if not file.is_file():
+            raise FileNotFoundError(f"{file}: there is no such file, though other sizes of this scan are there")
+        content = file.read_bytes()
+        whole = _HEADER + 2 * rows * columns
+        if len(content) != whole:
+            raise ValueError(
+                f"{file}: holds {len(content)} bytes, {rows}x{columns} ranges take {whole}; download it again"
+            )
+        header = np.frombuffer(content, "<u8", 2).tolist()
+        if header != [rows, columns]:
+            raise ValueError(f"{file}: its header says {header[0]}x{header[1]}, its folder {rows}x{columns}")
+        ranges = np.frombuffer(content, "<f2", offset=_HEADER).reshape(columns, rows).T.astype(np.float32)
+        try:
+            return Scan(torch.from_numpy(np.where(ranges > sensor.max_range, 0, ranges)), sensor)
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from None
+
+    def pose(self, number: int) -> torch.Tensor:
+        """Raises ValueError: the authors' files do not tell where a scan was taken."""
+        raise ValueError(f"{self.path}: .rimg files hold no poses; only archives made by `simulate` do")
+
+    def town(self, number: int) -> str:
+        """Returns in which of `towns` a scan was taken."""
+        return self._numbered(number)[0]
+
+    def _numbered(self, number: int) -> tuple[str, int, Path]:
+        if not 0 <= number < len(self):
+            raise IndexError(f"{self.path}: there is no scan {number}; its {len(self)} scans are numbered from 0")
+        return self._scans[number]

@@ -1,0 +1,95 @@
+"""Mesh files, through PyVista's many readers.
+
+VTK's readers write to stderr, return empty meshes, or crash the process when a file is damaged. So they run in a
+process of their own, `python -m ilnet.world.meshes FILE OUT.npz`, which may do all that.
+"""
+
+import json
+import math
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+__all__ = ["read", "read_positions"]
+
+
+def read(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
+    """Reads the triangles of any mesh file that PyVista reads; other polygons are cut into triangles.
+
+    Args:
+        path: The file; metres, z up.
+
+    Returns:
+        vertices: (V, 3) float32, or float64 where the file holds that.
+        triangles: (F, 3) int32.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it is not a whole mesh, holds no triangle, or holds NaN.
+    """
+    path = Path(path)
+    if not path.is_file():
+        what = "is a folder" if path.is_dir() else "there is no such file"
+        raise FileNotFoundError(f"{path}: {what}; give the path of a mesh")
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "mesh.npz"
+        command = [sys.executable, "-m", "ilnet.world.meshes", str(path), str(out)]
+        reader = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+        if reader.returncode:
+            reason = (reader.stderr.strip().splitlines() or ["it crashed"])[-1]
+            raise ValueError(f"{path}: not a mesh that PyVista reads, or cut short; its reader said: {reason}")
+        with np.load(out) as arrays:
+            vertices, triangles = arrays["vertices"], arrays["triangles"]
+    if len(triangles) == 0:
+        raise ValueError(
+            f"{path}: holds no triangle; give a mesh with faces, not a point cloud or another kind of file"
+        )
+    if not np.isfinite(vertices).all():
+        raise ValueError(f"{path}: holds NaN or infinite vertices; clean the mesh first")
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise ValueError(f"{path}: its triangles name vertices that are not there; the file is damaged")
+    return vertices, triangles
+
+
+def read_positions(path: str | Path, height: float | None = None) -> np.ndarray:
+    """Reads where a sensor stands in a mesh, from JSON such as `{"positions": [[x, y, z], ...]}`.
+
+    Args:
+        path: The file.
+        height: Metres above the ground to move the positions to; the file then tells theirs as `sensor_height_m`.
+
+    Returns:
+        (N, 3) float64 metres, N > 0.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If it holds anything else.
+    """
+    try:
+        content = json.loads(Path(path).read_bytes())
+        positions = np.array(content["positions"], dtype=np.float64)
+        lift = 0.0 if height is None else height - float(content["sensor_height_m"])
+        if positions.ndim != 2 or positions.shape[1] != 3 or len(positions) == 0:
+            raise ValueError("not a list of [x, y, z]")
+        if not np.isfinite(positions).all() or not math.isfinite(lift):
+            raise ValueError("NaN or infinite numbers")
+    except (ValueError, TypeError, KeyError) as error:
+        needed = '"positions": [[x, y, z], ...]' + ("" if height is None else ', "sensor_height_m": z')
+        problem = f"lacks {error}" if isinstance(error, KeyError) else error
+        raise ValueError(f"{path}: should be JSON like {{{needed}}}, metres in the mesh ({problem})") from None
+    return positions + np.array([0, 0, lift])
+
+
+def _convert(path: str, out: str) -> None:
+    import pyvista
+
+    mesh = pyvista.wrap(pyvista.read(path)).extract_surface(algorithm=None).triangulate()
+    triangles = mesh.regular_faces if mesh.n_cells else np.empty((0, 3))
+    np.savez(out, vertices=np.asarray(mesh.points), triangles=np.asarray(triangles, np.int32))
+
+
+if __name__ == "__main__":
+    _convert(*sys.argv[1:])

@@ -1,0 +1,223 @@
+"""What moves: vehicles on the lanes and at the kerb, people on the pavements, drawn anew for every scan."""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ilnet.world.towns import vehicles
+from ilnet.world.towns.parts import EMPTY, Part, merge, place, raster
+from ilnet.world.towns.town import Town
+
+__all__ = ["traffic"]
+
+_CARS, _VAN, _LORRY, _BUS, _CYCLIST, _BICYCLE, _PEOPLE = (0, 1, 2), 3, 4, 5, 6, 7, (8, 9, 10)
+# Metres kept free ahead of and behind the sensor, whose own car is not drawn, and to its sides.
+_OWN_CAR = (4.5, 1.3)
+_STRETCH = 1.05  # vehicles differ in length, width and height by up to 5 %
+
+
+class _Kind(NamedTuple):
+    part: Part
+    half_length: float
+    half_width: float
+    gap: float
+    """Metres kept free before and behind it while it drives."""
+
+
+class _Things(NamedTuple):
+    """What might be drawn, N of them, the first ones first."""
+
+    spot: np.ndarray
+    """(N, 4) x, y, z [m] and heading [rad]."""
+    slope: np.ndarray
+    """(N,) rise over run along the heading."""
+    kind: np.ndarray
+    """(N,) row of the fleet."""
+    gap: np.ndarray
+    """(N,) metres kept free before and behind."""
+
+
+@cache
+def _fleet() -> tuple[_Kind, ...]:
+    """Returns the prototypes, by the numbers above."""
+    walkers = [vehicles.pedestrian(*pose) for pose in ((0.7, 0.25), (0.5, 0.15), (0.1, 0.05))]
+    gaps = {_LORRY: 3.5, _BUS: 3.5, _CYCLIST: 0.8} | dict.fromkeys((*_CARS, _VAN), 1.0)
+    heavy = [vehicles.van(), vehicles.lorry(), vehicles.bus()]
+    parts = [*map(vehicles.car, range(3)), *heavy, vehicles.cyclist(), vehicles.bicycle()]
+    kinds = []
+    for number, part in enumerate(parts + walkers):
+        reach = np.abs(part.vertices[:, :2]).max(0) * _STRETCH
+        kinds.append(_Kind(part, float(reach[0]), float(reach[1]), gaps.get(number, 0.1)))
+    return tuple(kinds)
+
+
+def traffic(
+    town: Town,
+    at: ArrayLike,
+    seed: int | Sequence[int],
+    radius: float = 85.0,
+    sector: tuple[float, float] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draws the vehicles and people around a sensor; another seed draws others, more of them or fewer.
+
+    No two overlap. The sensor's own car is left out, and its lane is free for about 5 m.
+
+    Args:
+        town: Where.
+        at: (3,) position of the sensor, metres.
+        seed: Of the draw; the same town, place and seed give the same arrays.
+        radius: How far from the sensor they are drawn, metres.
+        sector: The direction [rad, from +x] in which a sensor looks that does not turn full circle, and half the width
+            [rad] of what it sees; what stands elsewhere is left out, and the rest stays as it is.
+
+    Returns:
+        Vertices (V, 3) float32 [m] and triangles (F, 3) int32; empty where nothing is about.
+
+    Raises:
+        ValueError: If `at` is not three finite numbers.
+    """
+    position = np.asarray(at, dtype=np.float64)
+    if position.shape != (3,) or not np.isfinite(position).all():
+        raise ValueError(f"at is {at!r}, should be three finite numbers: x, y, z in metres")
+    rng, sensor = np.random.default_rng(seed), position[:2]
+    near = np.nonzero(_distance(town.waypoints, sensor) < radius)[0]
+    lane = np.column_stack([town.waypoints[near], town.headings[near]]).astype(np.float64)
+    slope = _slope(town, near)
+    parking, walks = (
+        spots[_distance(spots, sensor) < radius].astype(np.float64) for spots in (town.parking, town.walks)
+    )
+    drawn = [
+        _driving(lane, slope, walks, rng),
+        _crossing(lane, walks, rng),
+        _parked(parking, lane, slope, rng),
+        _walking(walks, rng),
+    ]
+    things = _Things(*(np.concatenate(column) for column in zip(*drawn, strict=True)))
+    heading = lane[_distance(lane, sensor).argmin(), 3] if len(lane) else 0.0
+    keep = _apart(things, sensor, heading)
+    things = _Things(*(column[keep] for column in things))
+    scale = rng.uniform(2 - _STRETCH, _STRETCH, (len(keep), 3))
+    if sector:
+        seen = _in_sector(things, sensor, *sector)
+        things, scale = _Things(*(column[seen] for column in things)), scale[seen]
+    part = merge([_instances(things, number, scale) for number in range(len(_fleet()))])
+    return raster(part.vertices), part.triangles.astype(np.int32)
+
+
+def _distance(points: np.ndarray, sensor: np.ndarray) -> np.ndarray:
+    return np.hypot(points[:, 0] - sensor[0], points[:, 1] - sensor[1])
+
+
+def _in_sector(things: _Things, sensor: np.ndarray, heading: float, half: float) -> np.ndarray:
+    """Which things (N,) reach into a sector, judged by the circles around them."""
+    away = things.spot[:, :2] - sensor
+    distance = np.hypot(away[:, 0], away[:, 1])
+    reach = np.array([np.hypot(k.half_length, k.half_width) for k in _fleet()])[things.kind]
+    aside = np.abs(np.mod(np.arctan2(away[:, 1], away[:, 0]) - heading + np.pi, 2 * np.pi) - np.pi)
+    return (distance <= reach) | (aside < half + np.arcsin(np.minimum(reach / np.maximum(distance, 1e-9), 1)))
+
+
+def _slope(town: Town, near: np.ndarray) -> np.ndarray:
+    """Rise over run (N,) from waypoints `near` to the next on their lane; 0 at the lane's end."""
+    step = (town.waypoints[np.minimum(near + 1, len(town.waypoints) - 1)] - town.waypoints[near]).astype(np.float64)
+    run = np.hypot(step[:, 0], step[:, 1])
+    return np.where((run > 1.0) & (run < 2.5), step[:, 2] / np.maximum(run, 1.0), 0.0)
+
+
+def _things(spot: np.ndarray, slope: ArrayLike, kind: np.ndarray, drives: bool) -> _Things:
+    gap = np.array([k.gap for k in _fleet()])[kind] if drives else np.full(len(spot), 0.1)
+    return _Things(spot, np.broadcast_to(np.asarray(slope, dtype=np.float64), (len(spot),)), kind, gap)
+
+
+def _aside(spot: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Spots (N, 4) moved `right` metres (N,) to the right of their heading."""
+    step = np.column_stack([np.sin(spot[:, 3]), -np.cos(spot[:, 3])]) * right[:, None]
+    return np.column_stack([spot[:, :2] + step, spot[:, 2:]])
+
+
+def _driving(lane: np.ndarray, slope: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> _Things:
+    """On the lanes, from an empty road to a slow column; cyclists keep to the right, and off the highways."""
+    spacing = np.exp(rng.uniform(np.log(16), np.log(110)))
+    pick = rng.permutation(np.nonzero(rng.random(len(lane)) < 1.8 / spacing)[0])
+    lorries, cyclists = rng.uniform(0.03, 0.2), rng.uniform(0.0, 0.12)
+    cars = 0.87 - lorries - cyclists
+    share = [0.4 * cars, 0.35 * cars, 0.25 * cars, 0.13, 0.8 * lorries, 0.2 * lorries, cyclists]
+    kind = rng.choice([*_CARS, _VAN, _LORRY, _BUS, _CYCLIST], len(pick), p=share)
+    kind = np.where((kind == _CYCLIST) & ~_beside(lane[pick], walks), _CARS[0], kind)
+    right = np.where(kind == _CYCLIST, 0.75, rng.uniform(-0.15, 0.15, len(pick)))
+    return _things(_aside(lane[pick], right), slope[pick], kind, drives=True)
+
+
+def _crossing(lane: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> _Things:
+    """A few people on the carriageway, square to a lane, where there are pavements."""
+    spot = lane[rng.random(len(lane)) < rng.uniform(0, 5) / max(len(lane), 1)]
+    spot = spot[_beside(spot, walks)]
+    spot = _aside(spot, rng.uniform(-1.5, 1.5, len(spot)))
+    spot[:, 3] += np.pi / 2 * rng.choice([-1, 1], len(spot))
+    return _things(spot, 0.0, rng.choice(_PEOPLE, len(spot)), drives=False)
+
+
+def _beside(lane: np.ndarray, walks: np.ndarray) -> np.ndarray:
+    """Whether people walk within 12 m of points (N, 4) on lanes."""
+    return (np.hypot(*(lane[:, None, k] - walks[None, :, k] for k in (0, 1))) < 12).any(1)
+
+
+def _parked(parking: np.ndarray, lane: np.ndarray, slope: np.ndarray, rng: np.random.Generator) -> _Things:
+    """Cars, vans and now and then a bicycle at the kerb and on drives, most of them along the traffic."""
+    spot = parking[rng.random(len(parking)) < rng.uniform(0.15, 0.75)]
+    kind = rng.choice([*_CARS, _VAN, _BICYCLE], len(spot), p=[0.36, 0.27, 0.22, 0.12, 0.03])
+    spot[:, 3] += np.pi * (rng.random(len(spot)) < 0.15) + rng.normal(0, 0.02, len(spot))
+    tilt = np.zeros(len(spot))
+    if len(spot) and len(lane):  # the road beside them says how steeply they stand
+        beside = np.hypot(*(spot[:, None, k] - lane[None, :, k] for k in (0, 1))).argmin(1)
+        tilt = slope[beside] * np.cos(spot[:, 3] - lane[beside, 3])
+    return _things(spot, tilt, kind, drives=False)
+
+
+def _walking(walks: np.ndarray, rng: np.random.Generator) -> _Things:
+    """People on the pavements, and some bicycles that lean there."""
+    spot = walks[rng.random(len(walks)) < rng.uniform(0.02, 0.3)]
+    kind = rng.choice([*_PEOPLE, _BICYCLE], len(spot), p=[0.35, 0.3, 0.2, 0.15])
+    return _things(spot, 0.0, kind, drives=False)
+
+
+def _apart(things: _Things, sensor: np.ndarray, heading: float) -> np.ndarray:
+    """Numbers of those things that keep clear of the sensor's car and of all before them.
+
+    Two rectangles overlap where neither has a side between them: the distance of their centres along each axis of
+    either is less than what both reach along it.
+    """
+    fleet = _fleet()
+    length = np.array([k.half_length for k in fleet])[things.kind] + things.gap
+    width = np.array([k.half_width for k in fleet])[things.kind]
+    centre = np.concatenate([[sensor], things.spot[:, :2]])
+    turn = np.concatenate([[heading], things.spot[:, 3]])
+    length, width = np.concatenate([[_OWN_CAR[0]], length]), np.concatenate([[_OWN_CAR[1]], width])
+    axis = np.column_stack([np.cos(turn), np.sin(turn)])
+    gap = centre[None] - centre[:, None]
+    along = np.abs(gap[..., 0] * axis[:, None, 0] + gap[..., 1] * axis[:, None, 1])
+    across = np.abs(gap[..., 1] * axis[:, None, 0] - gap[..., 0] * axis[:, None, 1])
+    cos, sin = np.abs(np.cos(turn[:, None] - turn)), np.abs(np.sin(turn[:, None] - turn))
+    meet = (along < length[:, None] + length * cos + width * sin) & (
+        across < width[:, None] + length * sin + width * cos
+    )
+    meet &= meet.T
+    kept = np.zeros(len(turn), dtype=bool)
+    for number in range(len(turn)):
+        kept[number] = not (meet[number] & kept).any()
+    return np.nonzero(kept[1:])[0]
+
+
+def _instances(things: _Things, number: int, scale: np.ndarray) -> Part:
+    """All things of one kind, tilted as the road is; scale (N, 3) is of all things."""
+    pick = things.kind == number
+    if not pick.any():
+        return EMPTY
+    part = _fleet()[number].part
+    spot = things.spot[pick]
+    placed = place(part, spot[:, :3], spot[:, 3], scale[pick])
+    rise = part.vertices[:, 0] * (scale[pick, :1] * things.slope[pick, None])
+    return Part(placed.vertices + np.array([0.0, 0.0, 1.0]) * rise.reshape(-1, 1), placed.triangles)

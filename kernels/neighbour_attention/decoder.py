@@ -1,0 +1,300 @@
+"""fused_decode: the whole decoder of ILN at depth 1 on CPU cores, from the table of pixels to the range of each query.
+
+    t = z + Wq + b                           per neighbour of the query
+    t ← t + O attend(M LN(t))                `kernels.neighbour_attention.maths`
+    t ← t + W₂ gelu(W₁ LN(t) + b₁) + b₂
+    s = hᵀ LN(t),   r̂ = Σ_t softmax(s + p)_t r_t
+
+A frame of 128×2048 queries has a million tokens of 64 numbers, and the decoder passes over them a dozen times: done one
+operation after the other, it waits for memory. Here a thread takes some queries at a time through all operations; their
+tokens stay in the cache of its core, and only ranges are written. γ and β of the norms are multiplied into the weights
+behind them; what adds the same to the scores of all 4 neighbours, such as the bias of the head, does not change them.
+"""
+
+from typing import NamedTuple
+
+import torch
+import warp as wp
+
+from kernels import reference
+from kernels.checks import PRIORS, RANGE_FLOOR, check_backend, check_queries
+from kernels.lanes import LANES, add_products, gelu, rsqrt, total, vectors
+from kernels.launch import launch
+from kernels.neighbour_attention.maths import attend, stencil
+from kernels.neighbour_attention.table import Projected, head_last
+from kernels.neighbour_attention.vectors import HEADS, arguments, fits
+from kernels.stencil import area
+from kernels.vmap import refuse
+
+__all__ = ["DecoderWeights", "fused_decode", "fused_decode_serves"]
+
+# Threads that share the queries, and how many queries each takes at a time: their tokens fit the cache of a core, and a
+# layer's weights are read from its fastest part for all of them.
+_WORKERS = 64
+_GROUP = 16
+
+_BILINEAR = wp.constant(PRIORS.index("bilinear"))
+_PERSPECTIVE = wp.constant(PRIORS.index("perspective"))
+_RANGE_FLOOR = wp.constant(RANGE_FLOOR)
+
+_lanes = vectors(LANES, wp.float32)
+
+
+@wp.func
+def _normalise(x: wp.array2d[_lanes], row: int, eps: float, y_out: wp.array2d[_lanes]):
+    """LayerNorm of a row, without its weight and bias."""
+    channels = float(LANES * x.shape[1])
+    sums = _lanes()
+    for c in range(x.shape[1]):
+        sums += x[row, c]
+    mean = total(sums) / channels
+    squares = _lanes()
+    for c in range(x.shape[1]):
+        centred = x[row, c] - mean
+        squares += wp.cw_mul(centred, centred)
+    variance = total(squares) / channels
+    for i in range(LANES):
+        variance[i] = variance[i] + eps
+    inverse = rsqrt(variance)
+    for c in range(x.shape[1]):
+        y_out[row, c] = wp.cw_mul(x[row, c] - mean, inverse)
+
+
+@wp.func
+def _blend(scores: wp.vec4, ranges: wp.vec4, row: float, column: float, prior: int, area_floor: float):
+    """softmax(s + p) · r, as in `kernels.gather_blend`."""
+    factor = wp.vec4(1.0, 1.0, 1.0, 1.0)  # exp(p), so that neither 0 nor its logarithm is special
+    largest = float(-wp.inf)
+    for t in range(4):
+        if prior >= _BILINEAR:
+            factor[t] = wp.max(area(row, column, t), area_floor)
+        if prior == _PERSPECTIVE:
+            factor[t] = factor[t] / wp.max(ranges[t], _RANGE_FLOOR)
+        if factor[t] > 0.0:
+            largest = wp.max(largest, scores[t])
+    for t in range(4):
+        if factor[t] > 0.0:
+            factor[t] = factor[t] * wp.exp(scores[t] - largest)
+    return wp.dot(factor, ranges) / (factor[0] + factor[1] + factor[2] + factor[3])
+
+
+@wp.kernel(enable_backward=False)
+def _fused_decode_kernel(
+    first: int,
+    # in
+    pixels: wp.array2d[_lanes],
+    moments: wp.array2d[float],
+    queries: wp.array2d[float],
+    slope: wp.array2d[_lanes],
+    shift: wp.array[_lanes],
+    gram: wp.array2d[float],
+    height: int,
+    width: int,
+    per_image: int,
+    heads: int,
+    four: int,
+    eps: float,
+    wrap: int,
+    image: wp.array[float],
+    weights: wp.array3d[_lanes],
+    biases: wp.array2d[_lanes],
+    prior: int,
+    area_floor: float,
+    added: wp.array2d[float],
+    share: int,
+    group: int,
+    x_scalars: wp.array2d[float],
+    h_scalars: wp.array2d[float],
+    # out
+    tokens_out: wp.array2d[_lanes],
+    x_out: wp.array2d[_lanes],
+    h_out: wp.array2d[_lanes],
+    blended_out: wp.array[float],
+):
+    worker = first + wp.tid()
+    blocks = biases.shape[1]
+    row = worker * 4 * group
+    last = wp.min((worker + 1) * share, queries.shape[0])
+    for begin in range(worker * share, last, group):
+        end = wp.min(begin + group, last)
+        stop = row + 4 * (end - begin)
+        for n in range(begin, end):
+            pixel, down, right, inverse = stencil(
+                moments, queries, n, n // per_image, height, width, gram, LANES * blocks, eps, wrap
+            )
+            attend(
+                pixels, slope, shift, pixel, down, right, inverse, heads, 1, 0, four, row + 4 * (n - begin),
+                tokens_out, x_out,
+            )  # fmt: skip
+        for i in range(row, stop):
+            for c in range(blocks):
+                tokens_out[i, c] = tokens_out[i, c] + biases[0, c]
+        for i in range(row, stop, 4):
+            add_products(x_scalars, weights[0], i, tokens_out)
+        for i in range(row, stop):
+            _normalise(tokens_out, i, eps, x_out)
+            for c in range(blocks):
+                h_out[i, c] = biases[1, c]
+        for i in range(row, stop, 4):
+            add_products(x_scalars, weights[1], i, h_out)
+        for i in range(row, stop):
+            for c in range(blocks):
+                h_out[i, c] = gelu(h_out[i, c])
+                tokens_out[i, c] = tokens_out[i, c] + biases[2, c]
+        for i in range(row, stop, 4):
+            add_products(h_scalars, weights[2], i, tokens_out)
+        for n in range(begin, end):
+            pixel, down, right, inverse = stencil(
+                moments, queries, n, n // per_image, height, width, gram, LANES * blocks, eps, wrap
+            )
+            scores = wp.vec4()
+            ranges = wp.vec4()
+            for t in range(4):
+                i = row + 4 * (n - begin) + t
+                _normalise(tokens_out, i, eps, x_out)
+                score = _lanes()
+                for c in range(blocks):
+                    score += wp.cw_mul(x_out[i, c], biases[3, c])
+                scores[t] = total(score)[0]
+                ranges[t] = image[pixel[t]]
+            if added.shape[0] > 0:
+                for t in range(4):
+                    scores[t] = scores[t] + added[n, t]
+            blended_out[n] = _blend(scores, ranges, queries[n, 0], queries[n, 1], prior, area_floor)
+
+
+class DecoderWeights(NamedTuple):
+    """Weights of the decoder behind the first projection; shapes as in `torch.nn`, (out, in)."""
+
+    output: tuple[torch.Tensor, torch.Tensor]
+    """O (C, C) and its bias."""
+    norm: tuple[torch.Tensor, torch.Tensor]
+    """Weight and bias (C,) of the feed-forward's layer norm."""
+    hidden: tuple[torch.Tensor, torch.Tensor]
+    """W₁ (C, C) and b₁."""
+    back: tuple[torch.Tensor, torch.Tensor]
+    """W₂ (C, C) and b₂."""
+    head_norm: tuple[torch.Tensor, torch.Tensor]
+    """Weight and bias (C,) of the head's layer norm."""
+    score: tuple[torch.Tensor, torch.Tensor]
+    """h (1, C) and its bias."""
+
+
+def fused_decode_serves(projected: Projected) -> bool:
+    """Whether `fused_decode` has a kernel for this table: float32 on a CPU, the paper's 8 heads, C a multiple of 64."""
+    return fits(projected.pixels, torch.float32, len(projected.shift) // 3, projected.heads)
+
+
+@torch.library.custom_op("kernels::fused_decode", mutates_args=())
+def _fused_decode(
+    pixels: torch.Tensor,
+    queries: torch.Tensor,
+    slope: torch.Tensor,
+    shift: torch.Tensor,
+    gram: torch.Tensor,
+    image: torch.Tensor,
+    weights: torch.Tensor,
+    biases: torch.Tensor,
+    prior: int,
+    area_floor: float,
+    added: torch.Tensor,
+    eps: float,
+    wrap: bool,
+) -> torch.Tensor:
+    batch, count, _ = queries.shape
+    channels = biases.shape[1]
+    blended = pixels.new_empty(batch, count)
+    tokens, x, h = pixels.new_empty(3, 4 * _GROUP * _WORKERS, channels)
+    share = -(-batch * count // _WORKERS)
+    first = arguments(pixels, queries, slope, shift, gram, HEADS, eps, wrap)
+    others = [image.reshape(-1), weights, biases, prior, area_floor, added.view(-1, 4), share, _GROUP, x, h]
+    launch(_fused_decode_kernel, _WORKERS, [*first, *others], [tokens, x, h, blended.view(-1)], least=1)
+    return blended
+
+
+@_fused_decode.register_fake
+def _(
+    pixels: torch.Tensor,
+    queries: torch.Tensor,
+    slope: torch.Tensor,
+    shift: torch.Tensor,
+    gram: torch.Tensor,
+    image: torch.Tensor,
+    weights: torch.Tensor,
+    biases: torch.Tensor,
+    prior: int,
+    area_floor: float,
+    added: torch.Tensor,
+    eps: float,
+    wrap: bool,
+) -> torch.Tensor:
+    return pixels.new_empty(queries.shape[0], queries.shape[1])
+
+
+refuse(_fused_decode, "its image and queries have a batch dimension for that")
+
+
+def fused_decode(
+    projected: Projected,
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    weights: DecoderWeights,
+    prior: str = "none",
+    wrap: bool = True,
+    *,
+    area_floor: float = 0.0,
+    added: torch.Tensor | None = None,
+    eps: float = 1e-5,
+    backend: str = "warp",
+) -> torch.Tensor:
+    """Answers queries with ranges: attention, feed-forward, scores and blend in one pass. For inference: no gradients.
+
+    Args:
+        projected: `project_pixels` of the features; see `fused_decode_serves`.
+        image: (B, H, W) float32 ranges in metres, no return filled.
+        queries: (B, Q, 2) pixel coordinates (row, column).
+        weights: The decoder's.
+        prior: As in `gather_blend`.
+        wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
+        area_floor: As in `gather_blend`.
+        added: (B, Q, 4) to add to the scores, such as `plane_prior`.
+        eps: Of the layer norms.
+        backend: "warp", or "torch" for the plain twin in `kernels.reference`, which serves any table.
+
+    Returns:
+        (B, Q) float32 metres.
+
+    Raises:
+        TypeError: If `queries` is not a floating-point tensor.
+        ValueError: If the table is not served, or a shape, device, prior or backend does not fit.
+
+    Source: paper Fig. 3 and Eq. 3.
+    """
+    check_backend(backend)
+    if prior not in PRIORS:
+        raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}")
+    check_queries(queries, projected.pixels, "projected")
+    batch, height, width, _ = projected.pixels.shape
+    if image.shape != (batch, height, width):
+        raise ValueError(f"image has shape {tuple(image.shape)}; it should be {(batch, height, width)}")
+    if queries.ndim != 3 or len(queries) != batch:
+        raise ValueError(f"queries has shape {tuple(queries.shape)}; it should be ({batch}, Q, 2)")
+    if added is not None and added.shape != (batch, queries.shape[1], 4):
+        raise ValueError(f"added has shape {tuple(added.shape)}; it should be {(batch, queries.shape[1], 4)}")
+    if backend == "torch":
+        return reference.fused_decode(projected, image, queries, weights, prior, wrap, area_floor, added, eps)
+    if not fused_decode_serves(projected):
+        raise ValueError("projected has no kernel: it should be float32 on a CPU, with 8 heads and C a multiple of 64")
+    pixels, slope, shift, gram, heads = projected
+    with torch.no_grad(), torch.autocast(pixels.device.type, enabled=False):
+        (gamma, beta), (w1, b1), (head_gamma, _) = weights.norm, weights.hidden, weights.head_norm
+        output = weights.output[0][:, head_last(len(beta), heads, pixels.device)]
+        matrices = torch.stack((output.T, (w1 * gamma).T, weights.back[0].T)).float()
+        rows = torch.stack(
+            (weights.output[1], w1 @ beta + b1, weights.back[1], weights.score[0][0] * head_gamma)
+        ).float()
+        return _fused_decode(
+            pixels.contiguous(), queries.to(pixels.dtype).contiguous(), slope, shift, gram, image.float().contiguous(),
+            matrices, rows, PRIORS.index(prior), area_floor,
+            pixels.new_empty(0, 4) if added is None else added.to(pixels.dtype).contiguous(), eps, wrap,
+        )  # fmt: skip

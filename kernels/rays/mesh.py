@@ -1,0 +1,235 @@
+"""A mesh and its rays: nearest hits through Warp's bounding volume hierarchy, one thread a ray."""
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import warp as wp
+
+from kernels import reference
+from kernels.checks import broadcast_batch, check_backend, check_floating
+from kernels.launch import initialise, launch
+from kernels.rays.projection import Clusters, cluster_triangles, project_triangles, within_reach
+
+__all__ = ["Hits", "Mesh"]
+
+# Metres. A nearer hit is reported at this range, since 0 means none.
+_LEAST_RANGE = 1e-6
+# Triangles of a mesh that many rays will be cast at.
+_LARGE = 200_000
+# Rays that are cast one by one in the time that a projection takes to begin.
+_FEW_RAYS = 3000
+
+
+class Hits(NamedTuple):
+    """What rays met; all tensors have the rays' batch shape."""
+
+    range: torch.Tensor
+    """float32 [m], distance along the unit direction; 0 = nothing within the maximum range."""
+    triangle: torch.Tensor
+    """int32, number of the triangle that was hit; -1 = none."""
+    cosine: torch.Tensor
+    """float32 in [0, 1], of the angle between ray and surface normal, whichever way it points; 0 = none."""
+
+
+@wp.kernel(enable_backward=False)
+def _cast_rays_kernel(
+    first: int,
+    # in
+    mesh: wp.uint64,
+    origins: wp.array2d[float],
+    directions: wp.array2d[float],
+    max_range: float,
+    # out
+    ranges_out: wp.array[float],
+    triangles_out: wp.array[wp.int32],
+    cosines_out: wp.array[float],
+):
+    i = first + wp.tid()
+    origin = wp.vec3(origins[i, 0], origins[i, 1], origins[i, 2])
+    direction = wp.vec3(directions[i, 0], directions[i, 1], directions[i, 2])
+    hit = wp.mesh_query_ray(mesh, origin, direction, max_range)
+    if hit.result:
+        ranges_out[i] = wp.max(hit.t, _LEAST_RANGE)
+        triangles_out[i] = hit.face
+        cosines_out[i] = wp.min(wp.abs(wp.dot(hit.normal, direction)), 1.0)
+    else:
+        ranges_out[i] = 0.0
+        triangles_out[i] = -1
+        cosines_out[i] = 0.0
+
+
+class Mesh:
+    """Triangles that rays can be cast at, kept on one device with a hierarchy of boxes around them.
+
+    Both sides of a triangle are hit; triangles without an area never are. The mesh need not be watertight nor wound
+    consistently.
+
+    Args:
+        vertices: (V, 3) floating-point, metres, in any frame. They are copied; float64 keeps its precision far from the
+            frame's origin (georeferenced meshes).
+        triangles: (F, 3) integer, numbers of the vertices.
+        device: Where the mesh is kept and the rays are cast; a torch device or its name.
+
+    Raises:
+        TypeError: If an argument is not an array of numbers of the right kind.
+        ValueError: If the mesh is empty, a vertex is NaN or infinite, an index is out of bounds, or there is no such
+            device.
+    """
+
+    def __init__(
+        self,
+        vertices: torch.Tensor | np.ndarray,
+        triangles: torch.Tensor | np.ndarray,
+        device: torch.device | str = "cpu",
+    ):
+        points, faces = torch.as_tensor(vertices), torch.as_tensor(triangles)
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+            raise ValueError(f"vertices has shape {tuple(points.shape)}; it should be (V, 3) with V > 0")
+        if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+            raise ValueError(f"triangles has shape {tuple(faces.shape)}; it should be (F, 3) with F > 0")
+        if not points.is_floating_point():
+            raise TypeError(f"vertices is {points.dtype}; it should be floating-point, in metres")
+        if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
+            raise TypeError(f"triangles is {faces.dtype}; it should be an integer type")
+        points, faces = points.detach(), faces.detach().to(torch.int64)
+        if not (finite := points.isfinite().all(1)).all():
+            raise ValueError(
+                f"vertices holds {int((~finite).sum())} NaN or infinite of {len(points)}; remove them first"
+            )
+        if faces.min() < 0 or faces.max() >= len(points):
+            raise ValueError(
+                f"triangles runs from {int(faces.min())} to {int(faces.max())}; it should lie in 0..{len(points) - 1}"
+            )
+        try:
+            self.device = torch.empty(0, device=device).device
+        except (RuntimeError, AssertionError) as error:
+            raise ValueError(f"device is {device!r}, which is not there: {str(error).splitlines()[0]}") from None
+        initialise()
+        # Rays are cast in float32, whose millimetres end 10 km from the origin: so the origin is the mesh's middle.
+        self._middle = ((points.amin(0) + points.amax(0)).double() / 2).round().to(self.device)
+        self._vertices = (points.to(self.device).double() - self._middle).float()
+        self._triangles = faces.to(self.device, torch.int32).contiguous()
+
+    def __del__(self) -> None:
+        # Warp frees a tree at once, though rays may still be on their way through it.
+        if "_tree" in self.__dict__ and self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+
+    # Made when they are first asked for: few meshes need both.
+
+    @cached_property
+    def _tree(self) -> wp.Mesh:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)  # the copies ran on torch's stream, and the tree is built on Warp's
+        tree = wp.Mesh(
+            points=wp.from_torch(self._vertices, dtype=wp.vec3),
+            indices=wp.from_torch(self._triangles.view(-1), dtype=wp.int32),
+            # On CUDA Warp would build a tree in no time that rays take longer through: right for a mesh of one scan.
+            bvh_constructor="sah" if len(self._triangles) > _LARGE else None,
+        )
+        if self.device.type == "cuda":
+            wp.synchronize_device(str(self.device))  # and used on torch's again
+        return tree
+
+    @cached_property
+    def _clusters(self) -> Clusters:
+        return cluster_triangles(self._vertices, self._triangles)
+
+    def cast(self, origins: torch.Tensor, directions: torch.Tensor, max_range: float, backend: str = "warp") -> Hits:
+        """Finds the nearest hit of each ray.
+
+        Args:
+            origins: (..., 3) floating-point, metres, in the frame of the vertices, on the mesh's device.
+            directions: (..., 3) of any length but 0; leading dimensions broadcast against those of `origins`.
+            max_range: Metres; farther surfaces are not seen.
+            backend: "warp", or "torch" for the plain twin in `kernels.reference`, which tries every triangle.
+
+        Returns:
+            Hits of the broadcast shape (...).
+
+        Raises:
+            TypeError: If rays are not floating-point tensors.
+            ValueError: If a shape, device or backend does not fit, a ray is not finite, a direction has length 0, or
+                `max_range` is not a positive number.
+        """
+        check_backend(backend)
+        for name, tensor in (("origins", origins), ("directions", directions)):
+            check_floating(name, tensor, (torch.float32, torch.float64, torch.float16, torch.bfloat16), "(..., 3)")
+            if tensor.ndim == 0 or tensor.shape[-1] != 3:
+                raise ValueError(f"{name} has shape {tuple(tensor.shape)}; it should be (..., 3)")
+            if tensor.device != self.device:
+                raise ValueError(
+                    f"{name} is on {tensor.device}, the mesh on {self.device}; they should be on one device"
+                )
+            if not tensor.isfinite().all():
+                raise ValueError(f"{name} holds NaN or infinite values")
+        if not (directions != 0).any(-1).all():
+            raise ValueError("directions holds a direction of length 0; each should point somewhere")
+        if not isinstance(max_range, int | float) or not max_range > 0:
+            raise ValueError(f"max_range is {max_range}; it should be a number of metres above 0")
+        batch, (origins, directions) = broadcast_batch(
+            origins=(origins.detach(), 1), directions=(directions.detach(), 1)
+        )
+        origins = (origins.double() - self._middle).float()
+        # Lengths are evened out before float32, which cannot hold the square of a very long or very short one.
+        directions = (directions / directions.abs().amax(-1, keepdim=True)).float()
+        directions = torch.nn.functional.normalize(directions, dim=-1).contiguous()
+        if backend == "torch":
+            ranges, triangles, cosines = reference.cast_rays(
+                self._vertices, self._triangles, origins, directions, max_range
+            )
+        else:
+            ranges = origins.new_empty(len(origins))
+            triangles = torch.empty_like(ranges, dtype=torch.int32)
+            cosines = torch.empty_like(ranges)
+            inputs = [self._tree.id, origins, directions, float(max_range)]
+            launch(_cast_rays_kernel, len(origins), inputs, [ranges, triangles, cosines])
+        return Hits(ranges.view(batch), triangles.view(batch), cosines.view(batch))
+
+    def project(
+        self, pose: torch.Tensor, elevations: torch.Tensor, azimuths: torch.Tensor, max_range: float
+    ) -> torch.Tensor:
+        """Finds the range along each ray of a range image, whose rays all start at one point, without walking a tree.
+
+        The same ranges as `cast` gives, but for rays that graze an edge. The time grows with the triangles within
+        reach, and hardly with the number of rays; see `projects_faster`.
+
+        Args:
+            pose: (4, 4) transform from the sensor frame to that of the vertices, a rotation and a translation [m].
+            elevations: (H,) rad, of the rows, within ±90 degrees.
+            azimuths: (W,) rad, of the columns, all different, within one turn.
+            max_range: Metres; farther surfaces are not seen.
+
+        Returns:
+            (H, W) float32 metres; 0 where nothing is met.
+
+        Raises:
+            ValueError: If a shape does not fit, a table is empty or not finite, or `max_range` is not positive.
+        """
+        if pose.shape != (4, 4) or not pose.isfinite().all():
+            raise ValueError(f"pose has shape {tuple(pose.shape)}; it should be (4, 4), of finite numbers")
+        for name, table in (("elevations", elevations), ("azimuths", azimuths)):
+            if table.ndim != 1 or len(table) == 0 or not table.isfinite().all():
+                raise ValueError(f"{name} has shape {tuple(table.shape)}; it should be a list of finite numbers")
+        if not max_range > 0:
+            raise ValueError(f"max_range is {max_range}; it should be a number of metres above 0")
+        pose = pose.to(self.device).double()
+        origin, rotation = pose[:3, 3] - self._middle, pose[:3, :3]
+        return project_triangles(self._clusters, origin, rotation, elevations, azimuths, float(max_range))
+
+    def projects_faster(self, position: torch.Tensor, rays: int, max_range: float) -> bool:
+        """Tells whether `project` finds the ranges of so many rays from a position sooner than `cast`.
+
+        Args:
+            position: (3,) metres, in the frame of the vertices.
+            rays: Their number.
+            max_range: Metres, of the rays.
+
+        Returns:
+            False on CUDA. On a CPU a ray of `cast` takes as long as about four triangles within reach of `project`.
+        """
+        if self.device.type != "cpu":
+            return False
+        return rays > _FEW_RAYS + within_reach(self._clusters, position - self._middle, max_range) / 4

@@ -1,0 +1,178 @@
+import csv
+import math
+
+import pytest
+
+from ilnet import data, models
+from ilnet.commands import experiment
+from ilnet.learning import evaluate, metrics, train
+from ilnet.sensor import preset
+from ilnet.world.simulate import pose, simulate
+
+
+@pytest.fixture
+def study(tmp_path, monkeypatch, yard, quiet_street):
+    """Experiments in the yard, with networks and budgets of a size for tests."""
+    street = quiet_street(yard, [[3, 0, 0]])
+
+    def pairs(town, count, output):
+        return [tuple(simulate(yard, sensor, pose((3.0, 0.0, 1.8))) for sensor in (evaluate.INPUT, output))] * count
+
+    monkeypatch.setattr(train.data, "street", lambda *args: street)
+    monkeypatch.setattr(evaluate, "town_pairs", pairs)
+    monkeypatch.setattr(train, "HELD_OUT", {"town01": 1})
+    monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
+    monkeypatch.setattr(train, "OUTPUT", train.INPUT)  # a quarter of the work of each validation
+    monkeypatch.setattr(train, "VALIDATE_EVERY", (2, 2))
+    monkeypatch.setattr(experiment, "SIZES", ((16, 256), (32, 512)))
+    tables = experiment.PAPER["64x1024"], experiment.PAPER["128x2048"]
+    monkeypatch.setattr(experiment, "PAPER", dict(zip(("16x256", "32x512"), tables, strict=True)))
+    monkeypatch.setattr(experiment.plot, "point_clouds", lambda scans, path, reach: path.write_bytes(b"drawn"))
+    size = train.Preset(steps=4, blocks=1, crops=2, columns=32, queries=64, towns=("town01",))
+    monkeypatch.setitem(train.PRESETS, "tiny", size)
+    return experiment.Study("tiny", tmp_path / "out", scans=1, seeds=2)
+
+
+def rows(study, name):
+    with open(study.out / f"{name}.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_table_has_every_method_at_every_size_beside_the_paper(study):
+    experiment.table(study)
+    found = rows(study, "table")
+    assert [(row["size"], row["model"]) for row in found] == [
+        (size, name)
+        for size in ("16x256", "32x512")
+        for name in ("nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-prior")
+    ]
+    assert all(0 < float(row["iou"]) <= 1 for row in found if row["model"] != "liif")
+    assert {path.name for path in study.out.glob("*.png")} == {"table.png", "points-town07.png", "points-town10.png"}
+    page = experiment.results(study).read_text()
+    assert "| liif | 16x256 | 2 |" in page
+    assert "| 1.558 | 0.258 |" in page  # what the paper reports for LIIF at 64x1024
+
+
+def test_what_was_trained_is_not_trained_again(study, monkeypatch):
+    file = study.trained("iln-0", "iln")
+    before = file.read_bytes()
+    monkeypatch.setattr(train, "train", lambda *args, **kwargs: pytest.fail("trained again"))
+    assert study.trained("iln-0", "iln") == file
+    assert file.read_bytes() == before
+
+
+def test_convergence_follows_test_figures_over_seeds(study):
+    experiment.convergence(study)
+    found = rows(study, "convergence")
+    assert {(row["model"], row["seed"], row["step"]) for row in found} == {
+        (name, seed, step) for name in ("liif", "iln") for seed in "01" for step in "24"
+    }
+    assert all(float(row["seconds"]) > 0 for row in found)
+    page = experiment.results(study).read_text()
+    assert "| steps of liif to the IoU" in page
+    ends = [row for row in found if row["step"] == "4"]
+    assert all(f"| {row['model']} | {row['seed']} | 4 | {row['seconds']} |" in page for row in ends)
+    assert "| iln | 0 | 2 |" not in page
+
+
+def test_the_seconds_of_a_curve_are_of_the_median_pace(tmp_path):
+    log = tmp_path / "from-step-0" / "metrics.csv"
+    log.parent.mkdir()
+    lines = ["step,seconds,test/mae,test/iou,test/floating"]
+    lines += [f"{step},{seconds},2.0,0.3,0.1" for step, seconds in ((99, 10), (199, 20), (299, 5000), (399, 5010))]
+    log.write_text("\n".join(lines) + "\n")  # halted for more than an hour between 200 and 300
+    assert [row["seconds"] for row in experiment._probed(tmp_path)] == pytest.approx([10, 20, 30, 40])
+
+
+def test_steps_to_reach_by_hand():
+    curves = {"iln": {10: 0.30, 50: 0.40, 100: 0.41}, "liif": {10: 0.10, 50: 0.29, 100: 0.33}}
+    made = [
+        {"model": name, "step": step, "iou": iou + shift}
+        for name, curve in curves.items()
+        for step, iou in curve.items()
+        for shift in (-0.01, 0.01)
+    ]
+    reached = experiment.steps_to_reach(made)
+    assert reached == {"iou": pytest.approx(0.30), "iln_steps": 10, "liif_steps": 100, "ratio": 10}
+    never = [{**row, "iou": row["iou"] / 2} if row["model"] == "liif" else row for row in made]
+    assert math.isinf(experiment.steps_to_reach(never)["ratio"])
+
+
+def test_ablations_and_measured_scans(study, tmp_path, yard):
+    from ilnet import scan_files
+
+    frame = tmp_path / "frame.npz"
+    scan_files.write(frame, simulate(yard, preset("os1-32").resize(32, 256), pose((3.0, 0.0, 1.8))))
+    study = experiment.Study("tiny", study.out, 1, 1, measured=(frame,))
+    for name in ("attention", "prior", "real"):
+        experiment.EXPERIMENTS[name](study)
+        assert (study.out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+    assert [row["depth"] for row in rows(study, "attention")[::2]] == ["0", "1", "2", "4"]
+    kinds = "none", "bilinear", "perspective", "planes"
+    found = {(row["prior"], row["size"]): row for row in rows(study, "prior")}
+    assert {kind for kind, _ in found} == {*kinds, *(f"{kind}, snapped" for kind in kinds)}
+    assert all(found[kind, "32x512"]["mae"] != found[f"{kind}, snapped", "32x512"]["mae"] for kind in kinds)
+    assert {row["beams"] for row in rows(study, "real")} == {"8", "16"}
+    assert set(metrics.FIGURES[:5]) < set(rows(study, "real")[0])
+
+
+def test_without_a_preset_the_networks_that_ship_are_compared(study, monkeypatch):
+    study = experiment.Study(None, study.out)
+    assert study.networks() == {name: name for name in ("liif", "iln", "iln-prior")}
+    trained = []
+    monkeypatch.setattr(train, "train", lambda name, preset_name, *args, **kwargs: trained.append((name, preset_name)))
+    study.trained("iln-0", "iln")
+    assert trained == [("iln", "small")]
+
+
+def test_lidar_sr_has_a_network_for_each_size_that_is_stored(study, tmp_path, monkeypatch):
+    asked, drawn = [], []
+    archive = tmp_path / "stored"
+    sensors = {size: preset(f"paper-{size}") for size in ("16x1024", "64x1024")}
+    data.Archive.create(archive, 1, sensors, {"towns": ["nowhere"]})
+
+    def fake(name, preset_name, folder, archive=None, target=None, **options):
+        asked.append((folder.name, name, archive, target))
+        models.save(models.create("bilinear"), folder / f"{name}.safetensors", "bilinear", {}, steps=7)
+
+    monkeypatch.setattr(train, "train", fake)
+    monkeypatch.setattr(experiment, "SIZES", ((32, 512), (64, 1024)))
+    monkeypatch.setattr(experiment, "PAPER", dict.fromkeys(("32x512", "64x1024"), experiment.PAPER["32x512"]))
+    monkeypatch.setattr(experiment.plot, "point_clouds", lambda scans, path, reach: drawn.append(list(scans)))
+    experiment.table(experiment.Study("tiny", study.out, 1, 1, archive=archive))
+    assert asked[3:] == [("lidar-sr-64", "lidar-sr", archive, (64, 1024))]
+    assert [row["size"] for row in rows(study, "table") if row["model"] == "lidar-sr"] == ["64x1024"]
+    assert all("lidar-sr" in captions for captions in drawn)
+    assert "LiDAR-SR trained with preset tiny, 7 steps for 64 rows." in experiment.results(study).read_text()
+
+
+def test_ratios_by_hand():
+    def row(model, iou, mae, **more):
+        return {"model": model, "size": "128x2048", "iou": str(iou), "mae": str(mae), **more}
+
+    table = [row("liif", 0.2, 2.0), row("bilinear", 0.1, 4.0), row("iln", 0.3, 1.0), row("iln-prior", 0.36, 1.0)]
+    real = [row(name, iou, 1.0, scan="street", beams="32") for name, iou in (("bilinear", 0.2), ("iln-prior", 0.25))]
+    curves = [{"model": name, "step": "10", "iou": str(iou)} for name, iou in (("iln", 0.3), ("liif", 0.2))]
+    found = {row["figure"]: row for row in experiment.ratios({"table": table, "real": real, "convergence": curves})}
+    assert found["IoU of iln over liif, 128x2048"] == {
+        "figure": "IoU of iln over liif, 128x2048",
+        "the paper": "1.40",  # 0.331 / 0.236
+        "ours": "1.50",
+    }
+    assert found["MAE of iln over liif, 128x2048"]["ours"] == "0.50"
+    assert found["IoU of iln-prior over iln, 128x2048"] == {
+        "figure": "IoU of iln-prior over iln, 128x2048",
+        "the paper": "",
+        "ours": "1.20",
+    }
+    assert found["IoU of iln-prior over bilinear, street, 32 beams -> 128x2048"]["ours"] == "1.25"
+    [steps] = [row["ours"] for figure, row in found.items() if figure.startswith("steps of liif")]
+    assert steps == "never in its budget"
+    assert experiment.ratios({}) == []
+
+
+def test_what_is_missing_is_named(study):
+    with pytest.raises(ValueError, match=r"stored images are missing.*--data DIR"):
+        experiment.rays(study)
+    with pytest.raises(ValueError, match=r"no measured scans are named.*--measured FILE"):
+        experiment.real(study)

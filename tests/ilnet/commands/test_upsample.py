@@ -1,0 +1,128 @@
+"""The command `upsample`, in this process."""
+
+import numpy as np
+import pytest
+import torch
+
+from ilnet import models, scan_files
+from ilnet.scan import Scan
+from ilnet.sensor import Sensor, preset
+from ilnet.world.simulate import pose, simulate
+
+SENSOR = preset("paper-16x1024").resize(8, 128)
+
+
+@pytest.fixture
+def run(command):
+    def run(*arguments):
+        code, out, lines = command("upsample", *arguments)
+        return code, out, [line for line in lines if line.startswith("error: ")]
+
+    return run
+
+
+@pytest.fixture
+def seen(tmp_path, yard):
+    seen = simulate(yard, SENSOR, pose((0.0, 0.0, 1.8)))
+    scan_files.write(tmp_path / "in.npz", seen)
+    return seen
+
+
+def test_one_file_by_size(run, seen, tmp_path):
+    assert run("in.npz", "out/dense.npz", "--size", "20x300") == (0, "1 scan(s) written to out/dense.npz\n", [])
+    dense = scan_files.read(tmp_path / "out" / "dense.npz")
+    expected = models.load("iln-prior").upsample(seen, SENSOR.resize(20, 300))
+    assert dense.sensor == expected.sensor
+    assert torch.allclose(dense.ranges, expected.ranges.cpu(), atol=1e-3)
+
+
+def test_one_file_for_a_sensor_by_another_model(run, seen, tmp_path):
+    assert run("in.npz", "dense.ply", "--sensor", "vlp-16", "--model", "bilinear")[0] == 0
+    expected = models.load("bilinear").upsample(seen, preset("vlp-16"))
+    assert torch.allclose(scan_files.read(tmp_path / "dense.ply", preset("vlp-16")).ranges, expected.ranges, atol=1e-3)
+
+
+def test_a_folder_of_several_sensors(run, seen, tmp_path):
+    (tmp_path / "in" / "deeper").mkdir(parents=True)
+    scan_files.write(tmp_path / "in" / "a.npz", seen)
+    scan_files.write(tmp_path / "in" / "b.npz", seen.decimate(4))
+    (tmp_path / "in" / ".hidden").write_text("")
+    code, out, errors = run("in", "out", "--size", "16x256", "--model", "bilinear")
+    assert (code, out, errors) == (0, "2 scan(s) written to out\n", [])
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.npz", "b.npz"]
+    for name, rows in (("a.npz", 8), ("b.npz", 4)):
+        expected = models.load("bilinear").upsample(seen.decimate(rows), SENSOR.resize(16, 256))
+        assert torch.equal(scan_files.read(tmp_path / "out" / name).ranges, expected.ranges)
+
+
+def test_points_by_the_angles_of_their_sensor(run, yard, tmp_path):
+    (tmp_path / "in").mkdir()
+    seen = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    scan_files.write(tmp_path / "in" / "a.pcd", seen)
+    options = ("--sensor", "paper-64x1024", "--model", "bilinear", "--from", "paper-16x1024", "--format", "ply")
+    assert run("in", "out", *options)[0] == 0
+    dense = scan_files.read(tmp_path / "out" / "a.ply", preset("paper-64x1024"))
+    expected = models.load("bilinear").upsample(seen, preset("paper-64x1024"))
+    assert torch.allclose(dense.ranges, expected.ranges, atol=1e-3)
+
+
+def test_a_bad_file_does_not_keep_the_others_from_being_done(run, seen, tmp_path):
+    (tmp_path / "in").mkdir()
+    scan_files.write(tmp_path / "in" / "a.npz", seen)
+    (tmp_path / "in" / "b.npz").write_bytes((tmp_path / "in" / "a.npz").read_bytes()[:500])
+    scan_files.write(tmp_path / "in" / "c.pcd", seen)
+    scan_files.write(tmp_path / "in" / "d.npz", seen)
+    np.save(tmp_path / "in" / "d.npy", seen.ranges.numpy())
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "before.npz").write_text("kept")
+    (tmp_path / "out" / "b.npz").write_text("kept")
+    code, out, errors = run("in", "out", "--size", "16x256", "--model", "nearest")
+    assert code == 2
+    assert out == "2 scan(s) written to out, 3 could not be: see above\n"
+    assert [error.split(":")[1].strip() for error in errors] == ["in/b.npz", "in/c.pcd", "in/d.npy"]
+    assert "--from" in errors[1]
+    assert (tmp_path / "out" / "before.npz").read_text() == (tmp_path / "out" / "b.npz").read_text() == "kept"
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.npz", "b.npz", "before.npz", "d.npz"]
+
+
+def test_of_two_files_with_one_name_the_first_is_kept(run, tmp_path):
+    (tmp_path / "in").mkdir()
+    sensor = preset("hdl-64e")
+    scan_files.write(tmp_path / "in" / "a.npz", Scan(torch.full(sensor.shape, 5.0), sensor))
+    np.array([[9.0, 0.0, 0.0, 0.0]], np.float32).tofile(tmp_path / "in" / "a.bin")
+    code, _, [error] = run("in", "out", "--size", "64x512", "--model", "nearest")
+    assert code == 2
+    assert "in/a.npz: another file" in error
+    assert scan_files.read(tmp_path / "out" / "a.npz").ranges.max() == 9
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("nowhere.npz", "out.npz", "--size", "16x256"), "nowhere.npz: there is no such file"),
+        (("in.npz", "out.npz"), "--size ROWSxCOLUMNS or --sensor NAME"),
+        (("in.npz", "out.npz", "--size", "16x256", "--sensor", "vlp-16"), "--size ROWSxCOLUMNS or --sensor NAME"),
+        (("in.npz", "out.npz", "--sensor", "vlp-61"), "unknown sensor 'vlp-61'"),
+        (("in.npz", "out.npz", "--size", "16x256", "--model", "ilm"), "unknown model 'ilm'"),
+        (("in.npz", "out.npz", "--size", "16x256", "--format", "ply"), "--format goes with a folder"),
+        (("in.npz", "out.xyz", "--size", "16x256"), "unknown suffix '.xyz'"),
+        (("in.npz", "in.npz", "--size", "16x256"), "in.npz is the file to be read"),
+        ((".", ".", "--size", "16x256"), ". is the folder to be read"),
+        (("empty", "out", "--size", "16x256"), "there is no file in this folder"),
+        ((".", "in.npz", "--size", "16x256"), "in.npz"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(run, seen, tmp_path, arguments, message):
+    (tmp_path / "empty").mkdir()
+    before = (tmp_path / "in.npz").read_bytes()
+    code, out, [error] = run(*arguments)
+    assert (code, out) == (2, "")
+    assert message in error
+    assert (tmp_path / "in.npz").read_bytes() == before
+
+
+def test_an_uneven_sensor_keeps_its_field_of_view(run, tmp_path, yard):
+    uneven = Sensor(np.deg2rad([-15.0, -8.0, -3.0, 0.0, 2.0]), np.deg2rad(np.arange(0.0, 90.0, 1.0)))
+    scan_files.write(tmp_path / "in.npz", simulate(yard, uneven, pose((0.0, 0.0, 1.8))))
+    assert run("in.npz", "out.npz", "--size", "10x180", "--model", "bilinear")[0] == 0
+    assert scan_files.read(tmp_path / "out.npz").sensor == uneven.resize(10, 180)

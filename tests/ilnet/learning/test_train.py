@@ -1,0 +1,241 @@
+import csv
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import get_worker_info
+
+from ilnet import data, models
+from ilnet.learning import metrics, train
+from ilnet.sensor import preset
+from ilnet.world import places
+from ilnet.world.simulate import pose, simulate
+
+
+@pytest.fixture
+def quick(monkeypatch, yard, quiet_street):
+    """Training in the yard, with a network and batches of a size for tests."""
+    street = quiet_street(yard, [[3, 0, 0]])
+    monkeypatch.setattr(train.data, "street", lambda *args: street)
+    monkeypatch.setattr(train, "HELD_OUT", {"town01": 1})
+    monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
+    size = train.Preset(blocks=1, steps=4, crops=2, columns=32, queries=64, towns=("town01",))
+    monkeypatch.setitem(train.PRESETS, "tiny", size)
+    return lambda out, **options: train.train("iln-prior", "tiny", out, features=16, heads=4, **options)
+
+
+def test_writes_weights_that_load_and_figures(tmp_path, quick):
+    figures = quick(tmp_path)
+    assert set(figures) == {f"val/{name}" for name in metrics.FIGURES}
+    model = models.load(tmp_path / "iln-prior.safetensors")
+    assert model.prior == models.create("iln-prior").prior
+    with open(tmp_path / "iln-prior" / "from-step-0" / "metrics.csv") as log:
+        assert any(row["val/iou"] for row in csv.DictReader(log))
+
+
+def test_the_same_seed_gives_the_same_weights(tmp_path, quick):
+    weights = []
+    for number, seed in enumerate((0, 0, 1)):
+        quick(tmp_path / str(number), seed=seed)
+        weights.append(models.load(tmp_path / str(number) / "iln-prior.safetensors").state_dict())
+    assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
+    assert not torch.equal(weights[0]["position.weight"], weights[2]["position.weight"])
+
+
+def test_a_worker_makes_the_batches_where_cores_are_to_spare(tmp_path, quick, monkeypatch):
+    asked = []
+    numbers = data._numbers
+    monkeypatch.setattr(data, "_numbers", lambda start: asked.append(get_worker_info()) or numbers(start))
+    alone = quick(tmp_path / "alone")
+    assert asked == [None]
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
+    assert quick(tmp_path / "beside") == alone
+    assert asked == [None]  # asked elsewhere
+
+
+def test_an_interrupted_run_goes_on_to_the_same_weights(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(train, "CHECKPOINT_EVERY", 2)
+    quick(tmp_path / "whole", steps=6)
+    with monkeypatch.context() as cut:
+        original = train.Training.training_step
+
+        def step_or_die(self, batch, index):
+            if self.global_step == 5:
+                raise SystemError("power cut")
+            return original(self, batch, index)
+
+        cut.setattr(train.Training, "training_step", step_or_die)
+        with pytest.raises(SystemError):
+            quick(tmp_path / "cut", steps=6)
+    assert (tmp_path / "cut" / "iln-prior" / "last.ckpt").exists()
+    with pytest.raises(ValueError, match=r"is an interrupted run of .*'steps': 6"):
+        quick(tmp_path / "cut", steps=8)
+    quick(tmp_path / "cut", steps=6)
+    whole, cut = (models.load(tmp_path / run / "iln-prior.safetensors").state_dict() for run in ("whole", "cut"))
+    assert all(torch.equal(whole[key], cut[key]) for key in whole)
+    # Both starts left their figures, and a finished run leaves no checkpoint to stumble over.
+    assert {p.name for p in (tmp_path / "cut" / "iln-prior").iterdir()} == {"from-step-0", "from-step-4"}
+
+
+def test_a_run_cut_in_a_validation_makes_up_for_it(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(train, "CHECKPOINT_EVERY", 10)
+    monkeypatch.setattr(train, "VALIDATE_EVERY", (2, 2))
+    quick(tmp_path / "whole", steps=6)
+    with monkeypatch.context() as cut:
+        original = train.Training.validation_step
+
+        def validate_or_die(self, place, index):
+            if self.global_step == 4:
+                raise SystemError("power cut")
+            return original(self, place, index)
+
+        cut.setattr(train.Training, "validation_step", validate_or_die)
+        with pytest.raises(SystemError):
+            quick(tmp_path / "cut", steps=6)
+    kept = torch.load(tmp_path / "cut" / "iln-prior" / "last.ckpt", weights_only=True)
+    [best] = [state["best_model_score"] for key, state in kept["callbacks"].items() if "ModelCheckpoint" in key]
+    quick(tmp_path / "cut", steps=6)
+
+    def validated(run):
+        found = []
+        for log in sorted((tmp_path / run / "iln-prior").glob("from-step-*/metrics.csv")):
+            with open(log, newline="") as file:
+                found += [(row["step"], row["val/iou"]) for row in csv.DictReader(file) if row["val/iou"]]
+        return found
+
+    assert [step for step, _ in validated("whole")] == ["1", "3", "5"]
+    assert validated("cut") == validated("whole")
+    assert best == pytest.approx(float(validated("cut")[0][1]))  # the run that went on knew how good the best was
+    whole, cut = (models.load(tmp_path / run / "iln-prior.safetensors").state_dict() for run in ("whole", "cut"))
+    assert all(torch.equal(whole[key], cut[key]) for key in whole)
+
+
+def test_the_figures_are_those_of_the_final_weights(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(train, "VALIDATE_EVERY", (3, 3))
+    figures = quick(tmp_path, steps=5)
+    model = models.load(tmp_path / "iln-prior.safetensors")
+    street = train.data.street()
+    sensors = [preset(train.INPUT), preset(train.OUTPUT)]
+    [[scan, truth]] = places.held_out_scans(street, 1, sensors)
+    mae = metrics.compare(model.ranges(scan, truth.sensor), truth)["mae"]
+    assert mae == pytest.approx(figures["val/mae"], rel=0.05)  # float32 here, bfloat16 there
+
+
+def test_training_lowers_the_loss(yard, quiet_street):
+    torch.manual_seed(0)
+    model = models.create("iln", features=16, blocks=1, heads=4, dropout=0.0)
+    street = quiet_street(yard, [[3, 0, 0]])
+    batch = next(iter(data.ContinuousRays([street], preset("paper-16x1024"), 4, 64, 256, seed=0)))
+    training = train.Training(model, [], 1e-3)
+    training.log = lambda *args, **kwargs: None
+    optimizer = torch.optim.Adam(model.parameters(), 3e-3)
+    losses = []
+    for _ in range(30):
+        optimizer.zero_grad()
+        loss = training.training_step(batch, 0)
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.8 * losses[0]
+
+
+def test_the_loss_is_in_units_of_the_normalised_range(yard):
+    model = models.create("iln", features=16, blocks=1, heads=4).eval()
+    training = train.Training(model, [], 1e-3)
+    training.log = lambda *args, **kwargs: None
+    batch = data.Batch(torch.full((1, 4, 8), 20.0), torch.rand(1, 5, 2) * 3, torch.full((1, 5), 70.0), False)
+    assert training.training_step(batch, 0).item() == pytest.approx(50 * 2 / 100)
+
+
+def test_unknown_names_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="unknown preset 'huge'; known are paper, laptop, small, tiny"):
+        train.train("iln", "huge", tmp_path)
+    with pytest.raises(ValueError, match="'bilinear' cannot be trained"):
+        train.train("bilinear", "tiny", tmp_path)
+
+
+def test_the_head_of_a_network_with_a_prior_gets_a_gradient(yard):
+    """Zero scores at the start must not be a dead end."""
+    model = models.create("iln-prior", features=16, blocks=1, heads=4)
+    here = pose((0.0, 0.0, 1.8))
+    image = simulate(yard, preset("paper-16x1024"), here).filled().unsqueeze(0)
+    queries = torch.rand(1, 500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([15.0, 1024.0])
+    model(image, queries).sum().backward()
+    assert model.head[1].weight.grad.abs().max() > 0
+
+
+def test_two_processes_share_a_batch_and_agree_with_one(tmp_path):
+    """The same gradients in both, those of one process, and the same figures over all held-out scans."""
+    script = Path(__file__).with_name("train_in_yard.py")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1"}
+    launcher = ["-m", "torch.distributed.run", "--nproc-per-node=2", "--master-port=0", "--standalone"]
+    for name, prefix in (("one", []), ("two", launcher)):
+        (tmp_path / name).mkdir()
+        command = [sys.executable, *prefix, str(script), str(tmp_path / name)]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr[-3000:]
+    alone = torch.load(tmp_path / "one" / "rank-alone.pt")
+    for rank in (0, 1):
+        shared = torch.load(tmp_path / "two" / f"rank-{rank}.pt")
+        assert len(shared["gradients"]) == len(alone["gradients"]) == 2
+        for ours, expected in zip(shared["gradients"], alone["gradients"], strict=True):
+            for name, gradient in expected.items():
+                torch.testing.assert_close(
+                    ours[name], gradient, rtol=1e-3, atol=1e-6, msg=lambda m, n=name: f"{n}: {m}"
+                )
+        assert shared["figures"] == pytest.approx(alone["figures"], abs=2e-4)
+    assert alone["gradients"][0]["model.head.1.weight"].abs().max() > 0
+
+
+def test_a_loss_that_is_not_a_number_stops_and_keeps_the_batch(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(data.ContinuousRays, "_draw", spoilt(data.ContinuousRays._draw, 2))
+    with pytest.raises(ValueError, match=r"the loss of step 2 is nan.*step-2.pt"):
+        quick(tmp_path)
+    kept = torch.load(tmp_path / "iln-prior" / "step-2.pt")
+    assert kept["batch"]["ranges"].isnan().any()
+    assert "head.1.weight" in kept["model"]
+
+
+def spoilt(draw, bad):
+    def drawn(self, number):
+        batch = draw(self, number)
+        return batch._replace(ranges=batch.ranges * torch.nan) if number == bad else batch
+
+    return drawn
+
+
+def test_stored_images_are_learned_from(tmp_path, quick, monkeypatch):
+    sensors = [preset("paper-16x1024"), preset("paper-128x2048")]
+    sizes = {"16x1024": sensors[0], "128x2048": sensors[1]}
+    archive = data.Archive.create(tmp_path / "data", 2, sizes, {"towns": ["nowhere"]})
+    flat = {size: np.full((2, *sensor.shape), 5000, np.uint16) for size, sensor in sizes.items()}
+    archive.write(0, flat, np.zeros(2, int), np.zeros(2, int), np.zeros((2, 4, 4)))
+    monkeypatch.setitem(train.PRESETS, "tiny", dataclasses.replace(train.PRESETS["tiny"], crops=2, columns=1024))
+    figures = quick(tmp_path / "out", archive=tmp_path / "data")
+    assert set(figures) == {f"val/{name}" for name in metrics.FIGURES}
+    with pytest.raises(ValueError, match=r"iln with preset paper learns from stored images.*128x2048 .*--data DIR"):
+        train.train("iln", "paper", tmp_path)
+    with pytest.raises(ValueError, match=r"lidar-sr with preset tiny learns from stored images.*16x1024,64x1024"):
+        train.train("lidar-sr", "tiny", tmp_path, target=(64, 1024))
+    with pytest.raises(ValueError, match=r"size is 70x1024; for lidar-sr it should be a multiple of 16x1024"):
+        train.train("lidar-sr", "tiny", tmp_path, archive=tmp_path / "data", target=(70, 1024))
+    with pytest.raises(FileNotFoundError, match="no such folder"):
+        quick(tmp_path / "out2", archive=tmp_path / "nothing")
+
+
+def test_lidar_sr_learns_the_one_size_that_it_predicts(tmp_path, quick, yard):
+    sensors = {size: preset(f"paper-{size}") for size in ("16x1024", "64x1024")}
+    archive = data.Archive.create(tmp_path / "data", 2, sensors, {"towns": ["nowhere"]})
+    flat = {size: np.full((2, *sensor.shape), 5000, np.uint16) for size, sensor in sensors.items()}
+    archive.write(0, flat, np.zeros(2, int), np.zeros(2, int), np.zeros((2, 4, 4)))
+    figures = train.train("lidar-sr", "tiny", tmp_path, steps=1, archive=tmp_path / "data", target=(64, 1024))
+    assert set(figures) == {f"val/{name}" for name in metrics.FIGURES}
+    model = models.load(tmp_path / "lidar-sr.safetensors")
+    assert (model.rows, model.columns) == (4, 1)
+    scan = simulate(yard, sensors["16x1024"], pose((0.0, 0.0, 1.8)))
+    assert model.upsample(scan, sensors["64x1024"]).sensor.shape == (64, 1024)
