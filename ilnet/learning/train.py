@@ -244,8 +244,10 @@ def train(
         )
     ]
     training = Training(model, held_out, size.rate, [epoch * per_epoch for epoch in size.halve_after], run, probe)
-    places = [(kind, place) for kind, pairs in training.pairs.items() for place in range(number, len(pairs), processes)]
-    scans: DataLoader[tuple[str, int]] = DataLoader(places, batch_size=None)  # type: ignore[arg-type]
+    numbered = [
+        (kind, place) for kind, pairs in training.pairs.items() for place in range(number, len(pairs), processes)
+    ]
+    scans: DataLoader[tuple[str, int]] = DataLoader(numbered, batch_size=None)  # type: ignore[arg-type]
     best = ModelCheckpoint(folder, "best", monitor="val/iou", mode="max", enable_version_counter=False)
     trainer = lightning.Trainer(
         max_steps=steps,

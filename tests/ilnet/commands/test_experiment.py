@@ -18,7 +18,7 @@ def study(tmp_path, monkeypatch, yard, quiet_street):
     def pairs(town, count, output):
         return [tuple(simulate(yard, sensor, pose((3.0, 0.0, 1.8))) for sensor in (evaluate.INPUT, output))] * count
 
-    monkeypatch.setattr(train.data, "street", lambda *args: street)
+    monkeypatch.setattr(train.places, "street", lambda *args: street)
     monkeypatch.setattr(evaluate, "town_pairs", pairs)
     monkeypatch.setattr(train, "HELD_OUT", {"town01": 1})
     monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)

@@ -116,8 +116,10 @@ def test_continuous_rays_meet_the_traffic_of_their_own_crop(monkeypatch):
     """What crops measure is what one crop alone measures in the world it stands in."""
     street = places.street("town01")
     drawn, casts = [], []
-    draw, cast = data.towns.traffic, simulate.cast
-    monkeypatch.setattr(data.towns, "traffic", lambda *args, **sector: drawn.append(args) or draw(*args, **sector))
+    draw, cast = data.batches.towns.traffic, simulate.cast
+    monkeypatch.setattr(
+        data.batches.towns, "traffic", lambda *args, **sector: drawn.append(args) or draw(*args, **sector)
+    )
     monkeypatch.setattr(simulate, "cast", lambda *args: casts.append(args) or cast(*args))
     batch = next(iter(data.ContinuousRays([street], SENSOR, crops=5, columns=96, queries=300, seed=3)))
     monkeypatch.undo()

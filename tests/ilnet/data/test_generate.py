@@ -17,13 +17,13 @@ import torch
 
 from ilnet.commands import cli
 from ilnet.data import generate, open_archive
-from ilnet.data import street as street_of
 from ilnet.data.archive import UNIT
 from ilnet.world import simulate, towns
 from ilnet.world.places import SENSOR_HEIGHT
+from ilnet.world.places import street as street_of
 from kernels import Mesh
 
-from .conftest import yard_triangles
+from ..conftest import yard_triangles
 
 SIZES = ("4x64", "16x128")
 SCANS = 3 * UNIT + 3

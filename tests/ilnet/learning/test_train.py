@@ -21,7 +21,7 @@ from ilnet.world.simulate import pose, simulate
 def quick(monkeypatch, yard, quiet_street):
     """Training in the yard, with a network and batches of a size for tests."""
     street = quiet_street(yard, [[3, 0, 0]])
-    monkeypatch.setattr(train.data, "street", lambda *args: street)
+    monkeypatch.setattr(train.places, "street", lambda *args: street)
     monkeypatch.setattr(train, "HELD_OUT", {"town01": 1})
     monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
     size = train.Preset(blocks=1, steps=4, crops=2, columns=32, queries=64, towns=("town01",))
@@ -49,8 +49,8 @@ def test_the_same_seed_gives_the_same_weights(tmp_path, quick):
 
 def test_a_worker_makes_the_batches_where_cores_are_to_spare(tmp_path, quick, monkeypatch):
     asked = []
-    numbers = data._numbers
-    monkeypatch.setattr(data, "_numbers", lambda start: asked.append(get_worker_info()) or numbers(start))
+    numbers = data.batches._numbers
+    monkeypatch.setattr(data.batches, "_numbers", lambda start: asked.append(get_worker_info()) or numbers(start))
     alone = quick(tmp_path / "alone")
     assert asked == [None]
     monkeypatch.setattr(torch, "get_num_threads", lambda: 4)

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from conftest import yard_triangles
 
 from ilnet.learning import train
@@ -23,7 +25,7 @@ def keep(training, optimizer):
     gradients.append({name: weight.grad.clone() for name, weight in training.named_parameters()})
 
 
-train.data.street = lambda *args: street
+train.places.street = lambda *args: street
 train.HELD_OUT, train.HELD_OUT_SCANS, train.PRECISION = {"town01": 1}, 3, "32-true"
 train.PRESETS["tiny"] = train.Preset(blocks=1, crops=4, columns=32, queries=64, towns=("town01",))
 train.Training.on_before_optimizer_step = keep

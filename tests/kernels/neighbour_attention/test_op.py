@@ -3,7 +3,7 @@ import torch
 import torch.nn.functional as F
 
 from kernels import attend_neighbours, gather_neighbours, neighbour_attention, project_pixels
-from kernels.neighbour_attention import _neighbour_attention
+from kernels.neighbour_attention.op import _neighbour_attention
 
 # Of the largest element: sums of some tens of products in another order.
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
