@@ -119,7 +119,7 @@ def test_the_figures_are_those_of_the_final_weights(tmp_path, quick, monkeypatch
     monkeypatch.setattr(train, "VALIDATE_EVERY", (3, 3))
     figures = quick(tmp_path, steps=5)
     model = models.load(tmp_path / "iln-prior.safetensors")
-    street = train.data.street()
+    street = train.places.street()
     sensors = [preset(train.INPUT), preset(train.OUTPUT)]
     [[scan, truth]] = places.held_out_scans(street, 1, sensors)
     mae = metrics.compare(model.ranges(scan, truth.sensor), truth)["mae"]
