@@ -7,7 +7,7 @@ import warp as wp
 
 from kernels import reference
 from kernels.checks import broadcast_batch, check_backend, check_floating, check_queries
-from kernels.launch import channel_spans, lanes, launch, overload_vectors
+from kernels.launch import channel_spans, launch, overload_vectors, vector_width
 from kernels.scatter import adjoint_of_gather
 from kernels.stencil import neighbour, offset
 from kernels.vmap import fold_into_batch
@@ -55,7 +55,7 @@ def _gather_neighbours(features: torch.Tensor, queries: torch.Tensor, wrap: bool
     count = queries.shape[1]
     gathered = features.new_empty(batch, count, 4, channels)
     offsets = queries.new_empty(batch, count, 4, 2)
-    width = lanes(channels)
+    width = vector_width(channels)
     span, spans = channel_spans(channels // width, features.device)
     inputs = [features, queries, span, int(wrap)]
     launch(_gather[features.dtype, width], batch * count * 4 * spans, inputs, [gathered, offsets])

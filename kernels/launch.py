@@ -17,12 +17,13 @@ __all__ = [
     "BLOCKS",
     "LEAST",
     "channel_spans",
+    "concrete",
     "initialise",
-    "lanes",
     "launch",
     "overload",
     "overload_vectors",
     "query_blocks",
+    "vector_width",
 ]
 
 # Below this many threads of work a second core costs more to wake than it saves.
@@ -38,8 +39,8 @@ _DTYPES = {
     torch.float16: (wp.float16, wp.float32),
 }
 
-# Channels that move together. 16 float32 are a cache line.
-_LANES = (1, 16)
+# How many channels may move together. 16 float32 are a cache line.
+_WIDTHS = (1, 16)
 
 _initialised = False
 _lock = threading.Lock()
@@ -94,64 +95,79 @@ def _start_warp() -> None:
             wp.init()
 
 
-def overload(kernel: wp.Kernel, half: bool = False) -> dict[torch.dtype, wp.Kernel]:
-    """Instantiates a generic kernel for the dtypes it serves.
+def concrete(kernel: wp.Kernel, known: dict[Any, type]) -> wp.Kernel:
+    """Instantiates a generic kernel.
 
-    All are made when the module is imported: a later overload would change the module's hash and compile it again.
+    All concrete kernels are to be made when their module is imported: a later one would change the module's hash, and
+    Warp would compile the module again.
 
     Args:
-        kernel: A kernel with two generic types. `Any` is what its tensors store; `wp.Float` is what it computes with,
-            in other tensors or in scalars: the same, but float32 beside half precision. In vectors of a fixed length
-            `wp.Scalar` stands for `Any`.
+        kernel: A kernel with generic types among its arguments: `Any`, `wp.Scalar`, `wp.Float` and the like.
+        known: For each generic type the scalar or vector that replaces it: as an argument, as the elements of an
+            array, and as the components of a vector.
+
+    Returns:
+        The concrete kernel.
+    """
+
+    def replaced(annotation: Any) -> Any:
+        if annotation in known:
+            return known[annotation]
+        if wp.types.is_array(annotation):
+            return wp.array(dtype=replaced(annotation.dtype), ndim=annotation.ndim)
+        if (scalar := getattr(annotation, "_wp_scalar_type_", None)) in known:
+            return wp.types.vector(annotation._length_, known[scalar])
+        return annotation
+
+    return wp.overload(kernel, [replaced(argument.type) for argument in kernel.adj.args])
+
+
+def overload(kernel: wp.Kernel, half: bool = False) -> dict[torch.dtype, wp.Kernel]:
+    """Instantiates a generic kernel for each dtype that it serves.
+
+    Args:
+        kernel: A kernel with two generic types. `Any` is what its tensors store. `wp.Float` is what it computes with,
+            in other tensors or in scalars: the same type, or float32 where half precision is stored. In vectors of a
+            fixed length `wp.Scalar` stands for `Any`.
         half: Whether bfloat16 and float16 are served besides float32 and float64.
 
     Returns:
         The concrete kernel for each torch dtype of the stored tensors.
     """
-    return {dtype: _concrete(kernel, *_DTYPES[dtype]) for dtype in _dtypes(half)}
-
-
-def overload_vectors(kernel: wp.Kernel, half: bool = False) -> dict[tuple[torch.dtype, int], wp.Kernel]:
-    """The same for a kernel that moves whole vectors of channels: many times faster than number by number on a CPU.
-
-    The last dimension of a tensor of type `Any` is then counted in vectors; `launch` sees to it.
-
-    Args:
-        kernel: As for `overload`; what is of type `Any` is only copied and added.
-        half: As for `overload`.
-
-    Returns:
-        The concrete kernel for each torch dtype and each of the numbers of lanes that `lanes` chooses from.
-    """
     return {
-        (dtype, n): _concrete(kernel, stored if n == 1 else wp.types.vector(n, stored), computed)
-        for dtype, (stored, computed) in _DTYPES.items()
-        if dtype in _dtypes(half)
-        for n in _LANES
+        dtype: concrete(kernel, {Any: stored, wp.Scalar: stored, wp.Float: computed})
+        for dtype, (stored, computed) in _dtypes(half).items()
     }
 
 
-def lanes(channels: int) -> int:
-    """The most lanes of a vector that so many channels are a multiple of."""
-    return max(n for n in _LANES if channels % n == 0)
+def overload_vectors(kernel: wp.Kernel, half: bool = False) -> dict[tuple[torch.dtype, int], wp.Kernel]:
+    """Instantiates a generic kernel that moves vectors of channels, which a CPU does many times faster than numbers.
+
+    The last dimension of a tensor of type `Any` is then counted in vectors; `launch` takes care of that.
+
+    Args:
+        kernel: As for `overload`. Elements of type `Any` are only copied and added.
+        half: As for `overload`.
+
+    Returns:
+        The concrete kernel for each torch dtype and each width that `vector_width` may choose.
+    """
+    return {
+        (dtype, width): concrete(
+            kernel, {Any: stored if width == 1 else wp.types.vector(width, stored), wp.Float: computed}
+        )
+        for dtype, (stored, computed) in _dtypes(half).items()
+        for width in _WIDTHS
+    }
 
 
-def _dtypes(half: bool) -> list[torch.dtype]:
-    return list(_DTYPES) if half else [torch.float32, torch.float64]
+def vector_width(channels: int) -> int:
+    """Returns how many channels move together as one vector: the most that divide `channels`."""
+    return max(width for width in _WIDTHS if channels % width == 0)
 
 
-def _concrete(kernel: wp.Kernel, stored: type, computed: type) -> wp.Kernel:
-    known = {Any: stored, wp.Scalar: stored, wp.Float: computed}
-
-    def concrete(annotation: Any) -> Any:
-        dtype: Any = getattr(annotation, "dtype", None)
-        if dtype in known:
-            return wp.array(dtype=known[dtype], ndim=annotation.ndim)
-        if (scalar := getattr(dtype, "_wp_scalar_type_", None)) in known:
-            return wp.array(dtype=wp.types.vector(dtype._length_, known[scalar]), ndim=annotation.ndim)
-        return known.get(annotation, annotation)
-
-    return wp.overload(kernel, [concrete(argument.type) for argument in kernel.adj.args])
+def _dtypes(half: bool) -> dict[torch.dtype, tuple[type, type]]:
+    return {dtype: types for dtype, types in _DTYPES.items() if half or dtype.itemsize >= 4}
 
 
 def _to_warp(argument: Any, annotation: Any) -> Any:

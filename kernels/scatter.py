@@ -5,7 +5,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from kernels.launch import lanes, launch, overload, overload_vectors
+from kernels.launch import launch, overload, overload_vectors, vector_width
 from kernels.stencil import base, bounds, column_of, query_of
 from kernels.vmap import fold_into_batch
 
@@ -209,23 +209,23 @@ def sum_by_pixel(gradients: torch.Tensor, queries: torch.Tensor, height: int, wi
     """`adjoint_of_gather` for many small cores: each pixel reads the queries of the cells around it, in their order."""
     order, starts = sort_queries(queries, height, width, wrap)
     pixels = gradients.new_zeros(len(gradients), height, width, gradients.shape[3])
-    lane = lanes(gradients.shape[3])
+    width = vector_width(gradients.shape[3])
     inputs = [gradients, order, starts, int(wrap)]
-    launch(_sum_gradients[gradients.dtype, lane], pixels.numel() // lane, inputs, [pixels])
+    launch(_sum_gradients[gradients.dtype, width], pixels.numel() // width, inputs, [pixels])
     return pixels
 
 
 def sum_by_query(gradients: torch.Tensor, queries: torch.Tensor, height: int, width: int, wrap: bool) -> torch.Tensor:
     """`adjoint_of_gather` for few big cores: each adds a share of queries and channels to pixels of its own."""
     batch, _, _, channels = gradients.shape
-    lane = lanes(channels)
-    blocks = channels // lane
+    width = vector_width(channels)
+    blocks = channels // width
     spans = min(blocks, -(-PARTS // batch))
     slices = -(-PARTS // (batch * spans))
     shares = gradients.new_empty(batch * slices, height * width, channels)
     span = -(-blocks // spans)
     launch(
-        _add_gradients[gradients.dtype, lane],
+        _add_gradients[gradients.dtype, width],
         batch * slices * -(-blocks // span),
         [gradients, queries, 0.0, height, width, span, int(wrap)],
         [shares],
@@ -238,8 +238,8 @@ def sum_slices(slices: torch.Tensor) -> torch.Tensor:
     """(B, P, C), the sum of slices (B, S, P, C) in their order."""
     # Not `sum`: torch's threads, once woken, spin for milliseconds on cores that the next launch wants.
     sums = slices.new_empty(slices.shape[0], *slices.shape[2:])
-    lane = lanes(slices.shape[3])
-    launch(_sum_slices[slices.dtype, lane], sums.numel() // lane, [slices, 0.0], [sums])
+    width = vector_width(slices.shape[3])
+    launch(_sum_slices[slices.dtype, width], sums.numel() // width, [slices, 0.0], [sums])
     return sums
 
 
