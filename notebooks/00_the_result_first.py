@@ -78,10 +78,10 @@ print("measured:", tuple(sparse.ranges.shape), " wanted:", tuple(truth.ranges.sh
 # **Predict:** what will the obvious method do to the outline of a car?
 
 # %%
-model = models.load("iln-prior")
+model = models.load("iln-prior").to(device)
 network = model.upsample(sparse, truth.sensor)
 
-bilinear = models.load("bilinear").upsample(sparse, truth.sensor)
+bilinear = models.load("bilinear").to(device).upsample(sparse, truth.sensor)
 
 # %% tags=["goal"]
 scans = {"measured, 16 beams": sparse, "bilinear": bilinear, "network (iln-prior)": network, "truth, 128 beams": truth}
@@ -166,7 +166,7 @@ show_scene(plotter)
 found = {}
 for name in ("bilinear", "iln-prior"):
     judge = metrics.ScanMetrics().to(device)
-    judge.update(models.load(name).ranges(sparse, truth.sensor), truth)
+    judge.update(models.load(name).to(device).ranges(sparse, truth.sensor), truth)
     found[name] = {key: value.item() for key, value in judge.compute().items()}
     mae, iou, floating = (found[name][key] for key in ("mae", "iou", "floating"))
     print(f"{name:>9}: MAE {mae:.2f} m, IoU {iou:.3f}, floating {floating:.1%}")

@@ -80,7 +80,8 @@ Work = Callable[[], list[torch.Tensor]]
 def _compare(name: str, size: str, ours: Work, others: dict[str, Work], repeat: int = 1) -> Iterator[Row]:
     """Times `ours` and each of the others in turns, `repeat` calls in each of the rounds; one row for each other."""
     for words, other in others.items():
-        results = [torch.cat([part.detach().float().flatten() for part in work()]) for work in (ours, other)]
+        # Other libraries answer on the CPU, whatever our device is.
+        results = [torch.cat([part.detach().float().cpu().flatten() for part in work()]) for work in (ours, other)]
         times: tuple[list[float], list[float]] = ([], [])
         for _ in range(ROUNDS):
             for work, seconds in zip((ours, other), times, strict=True):

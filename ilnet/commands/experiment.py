@@ -169,7 +169,8 @@ def _draw_points(study: Study, size: tuple[int, int], files: Mapping[str, str | 
     for town in towns.TEST:
         [(sparse, dense)] = evaluate.town_pairs(town, 1, evaluate.INPUT.resize(*size))
         shown = {"input": sparse}
-        shown |= {name: models.load(file).upsample(sparse, dense.sensor) for name, file in files.items()}
+        for name, file in files.items():
+            shown[name] = models.load(file).to(sparse.ranges.device).upsample(sparse, dense.sensor)
         plot.point_clouds({**shown, "truth": dense}, study.out / f"points-{town}.png", reach=20.0)
 
 
@@ -255,7 +256,8 @@ def attention(study: Study) -> None:
 
 def _frame_time(model: models.Model) -> float:
     [(scan, truth)] = evaluate.town_pairs(towns.TEST[0], 1, evaluate.INPUT.resize(*SIZES[1]))
-    frames = models.Upsampler(model, scan.sensor, truth.sensor, device=scan.ranges.device)
+    device = scan.ranges.device
+    frames = models.Upsampler(model.to(device), scan.sensor, truth.sensor, device=device)
     seconds = []
     for _ in range(4):
         start = time.perf_counter()

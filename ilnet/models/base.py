@@ -1,5 +1,8 @@
 """What all models share: one call, and the path from a scan to a denser scan."""
 
+import itertools
+import threading
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -12,51 +15,53 @@ from ilnet.sensor import Sensor
 
 __all__ = ["OFFSET_SCALE", "PRECISIONS", "Model", "Upsampler", "normalised", "returns"]
 
-# The authors measure offsets in half pixels; their checkpoints are worth the factor.
+# The authors measure offsets in half pixels; the factor lets their checkpoints load.
 OFFSET_SCALE = 2.0
 
 PRECISIONS = ("float32", "bfloat16")
 
-# Queries decoded at a time: the activations of so many fit the cache of a CPU core.
+# How many queries are decoded at a time: on a CPU, their activations fit the cache of a core.
 _TILE = {"cpu": 4096, "cuda": 65536}
 
 
 class Model(nn.Module):
     """A function r̂ = f(I, q) of a range image and query directions (paper, Eq. 1).
 
-    Its networks were trained with the lowest beam in row 0 and azimuths that rise; `ranges` and `upsample` turn scans
-    that are stored another way.
+    The networks were trained with the lowest beam in row 0 and with rising azimuths. `ranges` and `upsample` flip scans
+    that are stored in another order.
 
-    A subclass brings `decode`, `encode` where it extracts features, and `check_sensors` where it cannot predict any.
+    A subclass defines `decode`; `encode`, if it extracts features; and `check_sensors`, if it cannot predict every
+    sensor.
     """
 
     norm_range = 0.0
-    """Metres that the network sees as +1, and no return is filled with at least; 0 where it sees metres."""
+    """The range [m] that the network sees as +1, and the least that no return is filled with; 0 for models without
+    a network."""
 
     backend = "warp"
-    """Of the ops: "warp", or "torch" for their plain twins (`kernels.reference`)."""
+    """The backend of the ops: "warp", or "torch" for their plain twins (`kernels.reference`)."""
 
     def check_sensors(self, source: Sensor, target: Sensor) -> None:
-        """Raises a ValueError where the model cannot predict what `target` would measure from scans of `source`."""
+        """Raises a ValueError if the model cannot predict what `target` would measure from scans of `source`."""
 
     def encode(self, image: torch.Tensor, wrap: bool) -> Any:
-        """Computes once per image what all queries share; the image itself where there is nothing to extract.
+        """Computes what all queries of an image share; the image itself if there is nothing to extract.
 
         Args:
             image: (B, H, W) metres, no return filled.
             wrap: Whether column W-1 meets column 0.
 
         Returns:
-            What `decode` takes: features (B, C, H, W) with what belongs to them, or the image.
+            The first argument of `decode`: features (B, C, H, W), perhaps with more, or the image.
         """
         return image
 
     def decode(self, encoded: Any, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
-        """Answers queries (B, Q, 2) with ranges (B, Q) [m], from what `encode` made of the image."""
+        """Returns the ranges (B, Q) [m] of queries (B, Q, 2), given what `encode` returned for the image."""
         raise NotImplementedError
 
     def is_fused(self, encoded: Any) -> bool:
-        """Whether `decode` holds next to nothing per query, so that `Upsampler` need not give it tiles."""
+        """Returns whether `decode` needs almost no memory per query, so that `Upsampler` need not cut tiles."""
         return False
 
     def forward(self, image: torch.Tensor, queries: torch.Tensor, wrap: bool = True) -> torch.Tensor:
@@ -84,13 +89,17 @@ class Model(nn.Module):
         """Predicts what `sensor` would measure at the place of a scan, as the raw output of the network.
 
         Args:
-            scan: What was measured.
+            scan: The scan that was measured, on the model's device.
             sensor: The rays to predict; any tables within the field of view of the scan's sensor.
             precision: See `Upsampler`.
 
         Returns:
             (H, W) float32 metres on the scan's device; near `norm_range` means no return. Rays outside the field of
             view get the range of the outermost beam next to them.
+
+        Raises:
+            ValueError: If the model is not on the scan's device, the precision is unknown, or the model cannot predict
+                that sensor.
         """
         return Upsampler(self, scan.sensor, sensor, precision, scan.ranges.device).ranges(scan)
 
@@ -100,13 +109,17 @@ class Model(nn.Module):
         For many scans of one sensor, keep an `Upsampler`.
 
         Args:
-            scan: What was measured.
+            scan: The scan that was measured, on the model's device.
             sensor: The sensor whose scan is wanted, in the same frame: any resolution, any tables.
             precision: See `Upsampler`.
 
         Returns:
             A scan of `sensor`. Rays outside the field of view of the scan's sensor, those predicted beyond the maximum
             range of either, and those below the minimum range of `sensor`, hold no return.
+
+        Raises:
+            ValueError: If the model is not on the scan's device, the precision is unknown, or the model cannot predict
+                that sensor.
         """
         return Upsampler(self, scan.sensor, sensor, precision, scan.ranges.device)(scan)
 
@@ -114,19 +127,20 @@ class Model(nn.Module):
 class Upsampler:
     """Makes scans of one sensor from scans of another, frame after frame.
 
-    What frames have in common is prepared once. A frame is encoded once and its queries are decoded in tiles; beyond
-    the output the memory needed does not grow with their number. On CUDA the second frame is recorded as a graph and
-    the following ones replay it, without a word from the host in between; a single frame is not worth a recording.
+    What all frames share is prepared once. A frame is encoded once, and its queries are decoded in tiles, so that the
+    memory needed beyond the output does not grow with their number. On CUDA the second frame is recorded as a graph,
+    and later frames replay it without waiting for the host; a single frame is not worth a recording. Several threads
+    may share an upsampler.
 
     Args:
-        model: Whose weights are used as they are at each call; on CUDA they may change, but not move.
+        model: The model that predicts. Its weights are used as they are at each call; they may change, but not move.
         source: The sensor that measures.
         target: The sensor whose scans are wanted.
-        precision: "float32", or "bfloat16" for the layers that are faster so; the ranges themselves stay float32.
-        device: Where the scans and the model are.
+        precision: "float32", or "bfloat16" for the layers that are faster in it; the ranges themselves stay float32.
+        device: The device of the scans, and of the model's weights. "cuda" is the current CUDA device.
 
     Raises:
-        ValueError: If the precision is unknown, or the model cannot predict that sensor.
+        ValueError: If the precision is unknown, the model is on another device, or it cannot predict that sensor.
     """
 
     def __init__(
@@ -139,11 +153,12 @@ class Upsampler:
     ):
         if precision not in PRECISIONS:
             raise ValueError(f"precision is {precision!r}; it should be one of {', '.join(PRECISIONS)}")
+        self.device = _numbered(device)
+        _check_device(model, self.device)
         model.check_sensors(source, target)
         self.model, self.source, self.target = model, source, target
-        self.device = torch.device(device)
         self._half = precision == "bfloat16"
-        # The world is upright to a network as it was in training, whichever way a sensor stores its beams and columns.
+        # Networks were trained on upright images; a sensor may store its beams and columns in either order.
         tables = {-2: source.elevations, -1: source.azimuths}
         self._flips = [axis for axis, table in tables.items() if table[0] > table[-1]]
         upright = replace(source, elevations=np.sort(source.elevations), azimuths=np.sort(source.azimuths))
@@ -151,19 +166,24 @@ class Upsampler:
         self._seen = upright.contains(queries).to(self.device)
         self._queries = queries.view(1, -1, 2).to(self.device)
         self._warm = False
-        self._graph: torch.cuda.CUDAGraph | None = None
+        self._recording: _Recording | None = None
+        self._lock = threading.Lock()
 
     @torch.no_grad()
     def ranges(self, scan: Scan) -> torch.Tensor:
         """Predicts (H, W) float32 metres, the raw output of the network; see `Model.ranges`.
 
         Raises:
-            ValueError: If the scan is not one of the source sensor, or on another device.
+            ValueError: If the scan is not one of the source sensor, or the scan or the model is on another device.
         """
         if scan.sensor != self.source:
-            raise ValueError(f"the scan is of {scan.sensor!r}, but this upsampler was made for {self.source!r}")
-        if scan.ranges.device.type != self.device.type:
-            raise ValueError(f"the scan is on {scan.ranges.device}, but this upsampler was made for {self.device}")
+            raise ValueError(f"scan is of {scan.sensor!r}; it should be of {self.source!r}, as this upsampler is")
+        if scan.ranges.device != self.device:
+            raise ValueError(
+                f"scan is on {scan.ranges.device}; it should be on {self.device}, the device of this upsampler: "
+                f"call scan.to('{self.device}')"
+            )
+        _check_device(self.model, self.device)
         image = scan.filled(self.model.norm_range).flip(self._flips).unsqueeze(0)
         answer = self._replay(image) if self.device.type == "cuda" else self._answer(image)
         return answer.view(self.target.shape)
@@ -185,21 +205,54 @@ class Upsampler:
         return answer
 
     def _replay(self, image: torch.Tensor) -> torch.Tensor:
-        if not self._warm:  # a recording may neither load kernels nor try out algorithms
-            self._warm = True
-            return self._answer(image)
-        if self._graph is None:
-            self._image = image.clone()
-            self._graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(self._graph):
-                self._recorded = self._answer(self._image)
+        with self._lock:
+            if not self._warm:  # the first frame loads kernels and tries out algorithms, which a recording may not do
+                answer = self._answer(image)
+                self._warm = True
+                return answer
+            if self._recording is None:
+                self._recording = _Recording(self._answer, image)
+            return self._recording.replay(image)
+
+
+class _Recording:
+    """The work for one frame as a CUDA graph."""
+
+    def __init__(self, work: Callable[[torch.Tensor], torch.Tensor], image: torch.Tensor):
+        self._image = image.clone()
+        self._graph = torch.cuda.CUDAGraph()
+        # On a stream of this device, which need not be the current one; other threads may allocate memory meanwhile.
+        stream = torch.cuda.Stream(image.device)
+        with torch.cuda.graph(self._graph, stream=stream, capture_error_mode="thread_local"):
+            self._answer = work(self._image)
+        self._free = torch.cuda.Event()
+
+    def replay(self, image: torch.Tensor) -> torch.Tensor:
+        stream = torch.cuda.current_stream(image.device)
+        stream.wait_event(self._free)  # the frame before may still be under way on another stream
         self._image.copy_(image)
         self._graph.replay()
-        return self._recorded.clone()
+        answer = self._answer.clone()
+        stream.record_event(self._free)
+        return answer
+
+
+def _numbered(device: torch.device | str) -> torch.device:
+    """Returns the device as tensors on it name it: "cuda" is the current CUDA device."""
+    return torch.empty(0, device=device).device
+
+
+def _check_device(model: Model, device: torch.device) -> None:
+    """Raises a ValueError unless all weights are on the device; a model without weights is at home anywhere."""
+    for weight in itertools.chain(model.parameters(), model.buffers()):
+        if weight.device != device:
+            raise ValueError(
+                f"model is on {weight.device}; it should be on {device}, where the scans are: call model.to('{device}')"
+            )
 
 
 def normalised(image: torch.Tensor, norm_range: float) -> torch.Tensor:
-    """Scales ranges (B, H, W) [m] to the encoder's input (B, 1, H, W) in [-1, 1]; farther than `norm_range` is 1."""
+    """Returns ranges (B, H, W) [m] as the encoder's input (B, 1, H, W) in [-1, 1]; beyond `norm_range` all is 1."""
     return (image.clamp(max=norm_range) * (2 / norm_range) - 1).unsqueeze(1)
 
 
@@ -207,13 +260,13 @@ def returns(ranges: torch.Tensor, source: Sensor, sensor: Sensor) -> Scan:
     """Tells returns from no return in predicted ranges.
 
     Args:
-        ranges: (H, W) metres, of the rays of `sensor`.
-        source: The sensor they were predicted from.
-        sensor: The sensor they were predicted for.
+        ranges: (H, W) metres, predicted for the rays of `sensor`.
+        source: The sensor whose scan the ranges were predicted from.
+        sensor: The sensor that the ranges were predicted for.
 
     Returns:
-        A scan of `sensor`; 0 outside the field of view of `source` and outside the range limits of `sensor`, and
-        beyond the maximum range of `source`, where a blend with no return lies.
+        A scan of `sensor`. It holds 0 outside the field of view of `source`, outside the range limits of `sensor`,
+        and beyond the maximum range of `source`, where only blends of a return with no return lie.
     """
     return _returns(ranges, source.contains(source.grid_queries(sensor)).to(ranges.device), source, sensor)
 

@@ -1,5 +1,10 @@
+import contextlib
+import copy
 import json
 import math
+import time
+import types
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -7,9 +12,11 @@ import pytest
 import torch
 import torch.nn.functional as F
 from safetensors import safe_open
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from ilnet import models
 from ilnet.commands import demo
+from ilnet.models import base
 from ilnet.models.encoder import Encoder
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
@@ -244,8 +251,6 @@ def test_networks_see_every_sensor_upright(flips, yard):
 
 
 def test_upsample_does_not_depend_on_the_chunk(yard, monkeypatch):
-    from ilnet.models import base
-
     model = small("bilinear")
     scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
     expected = model.ranges(scan, preset("paper-64x1024"))
@@ -254,8 +259,6 @@ def test_upsample_does_not_depend_on_the_chunk(yard, monkeypatch):
 
 
 def test_upsample_decodes_in_pieces_of_bounded_size(yard):
-    from ilnet.models import base
-
     scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
     model, sizes = models.create("bilinear"), []
     decode = model.decode
@@ -325,15 +328,123 @@ def test_an_upsampler_serves_many_frames_of_its_sensor_only(yard):
         scan = simulate(yard, source, pose((x, 0.0, 1.8)))
         assert torch.equal(upsampler(scan).ranges, model.upsample(scan, target).ranges)
         assert upsampler(scan).sensor == target
-    with pytest.raises(ValueError, match="this upsampler was made for"):
+    with pytest.raises(ValueError, match=r"scan is of Sensor\(paper-64x1024.*; it should be of Sensor\(paper-16x1024"):
         upsampler(simulate(yard, target, pose((0.0, 0.0, 1.8))))
     with pytest.raises(ValueError, match="precision is 'half'; it should be one of float32, bfloat16"):
         models.Upsampler(model, source, target, "half")
 
 
+def on(device, scan):
+    """The scan with its ranges elsewhere; a device without numbers holds no scan that could be checked."""
+    elsewhere = copy.copy(scan)
+    object.__setattr__(elsewhere, "ranges", scan.ranges.to(device))
+    return elsewhere
+
+
+def test_a_model_elsewhere_than_its_scans_is_refused(yard):
+    model, source, target = small(), preset("paper-16x1024").resize(8, 64), preset("paper-64x1024").resize(16, 64)
+    scan = simulate(yard, source, pose((0.0, 0.0, 1.8)))
+    elsewhere = r"model is on cpu; it should be on meta, where the scans are: call model.to\('meta'\)"
+    for call in (model.ranges, model.upsample):
+        with pytest.raises(ValueError, match=elsewhere):
+            call(on("meta", scan), target)
+    with pytest.raises(ValueError, match=elsewhere):
+        models.Upsampler(model, source, target, device="meta")
+    upsampler = models.Upsampler(model, source, target)
+    with pytest.raises(ValueError, match=r"scan is on meta; it should be on cpu, .* call scan.to\('cpu'\)"):
+        upsampler(on("meta", scan))
+    model.to("meta")
+    with pytest.raises(ValueError, match="model is on meta; it should be on cpu"):
+        upsampler(scan)
+    assert models.Upsampler(models.create("planes"), source, target, device="meta").device.type == "meta"
+
+
+def test_the_number_of_a_device_counts():
+    sensor = preset("paper-16x1024").resize(8, 64)
+    with FakeTensorMode():  # as if there were GPUs
+        model = models.create("bilinear")
+        model.register_buffer("table", torch.zeros(1, device="cuda:1"))
+        assert models.Upsampler(model, sensor, sensor, device="cuda:1").device == torch.device("cuda", 1)
+        with pytest.raises(ValueError, match=r"model is on cuda:1; it should be on cuda:0.*model.to\('cuda:0'\)"):
+            models.Upsampler(model, sensor, sensor, device="cuda")
+
+
+@pytest.fixture
+def graphs(monkeypatch):
+    """CUDA graphs as far as the host sees them, on the CPU: a recording may fail, and replays its work once more."""
+
+    class Graph:
+        def __init__(self):
+            state.graphs.append(self)
+
+        def replay(self):
+            time.sleep(0.01)  # a frame is under way
+            state.replays += 1
+            state.recording._answer = state.work(state.recording._image)
+
+    @contextlib.contextmanager
+    def record(graph, **options):
+        yield
+        if state.fails:
+            raise RuntimeError("the recording failed")
+
+    def remember(recording, work, image):
+        state.recording, state.work = recording, work
+        make(recording, work, image)
+
+    state = types.SimpleNamespace(graphs=[], replays=0, fails=False)
+    make = base._Recording.__init__
+    nothing = types.SimpleNamespace(wait_event=lambda event: None, record_event=lambda event: None)
+    monkeypatch.setattr(base._Recording, "__init__", remember)
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", Graph)
+    monkeypatch.setattr(torch.cuda, "graph", record)
+    monkeypatch.setattr(torch.cuda, "Event", lambda: None)
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: None)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: nothing)
+    return state
+
+
+def test_a_recording_that_failed_is_made_again(graphs):
+    sensor = preset("paper-16x1024").resize(8, 64)
+    upsampler = models.Upsampler(models.create("bilinear"), sensor, sensor.resize(16, 64))
+    images = torch.rand(4, 1, 8, 64) * 50 + 3
+    assert torch.equal(upsampler._replay(images[0]), upsampler._answer(images[0]))
+    assert graphs.graphs == []  # a single frame is not worth one
+    graphs.fails = True
+    with pytest.raises(RuntimeError, match="the recording failed"):
+        upsampler._replay(images[1])
+    graphs.fails = False
+    for image in images[2:]:
+        assert torch.equal(upsampler._replay(image), upsampler._answer(image))
+    assert (len(graphs.graphs), graphs.replays) == (2, 2)
+
+
+def test_a_first_frame_that_failed_is_no_first_frame(graphs, monkeypatch):
+    sensor = preset("paper-16x1024").resize(8, 64)
+    upsampler = models.Upsampler(models.create("bilinear"), sensor, sensor.resize(16, 64))
+    image = torch.rand(1, 8, 64) * 50 + 3
+    with monkeypatch.context() as broken:
+        broken.setattr(upsampler, "_answer", lambda image: torch.rand(2) @ torch.rand(3))
+        with pytest.raises(RuntimeError):
+            upsampler._replay(image)
+    upsampler._replay(image)
+    assert graphs.graphs == []
+
+
+def test_threads_that_share_an_upsampler_get_their_own_frames(graphs):
+    sensor = preset("paper-16x1024").resize(8, 64)
+    upsampler = models.Upsampler(models.create("bilinear"), sensor, sensor.resize(16, 64))
+    images = torch.rand(12, 1, 8, 64) * 50 + 3
+    expected = [upsampler._answer(image) for image in images]
+    with ThreadPoolExecutor(4) as threads:
+        answers = list(threads.map(upsampler._replay, images))
+    assert all(map(torch.equal, answers, expected))
+    assert (len(graphs.graphs), graphs.replays) == (1, 11)
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("precision", models.PRECISIONS)
-def test_on_cuda_frames_replay_a_graph_without_a_word_from_the_host(precision, yard):
+def test_on_cuda_frames_replay_a_graph_without_waiting(precision, yard):
     torch.manual_seed(0)
     model = models.ILN(blocks=2).eval()
     source, target = preset("paper-16x1024"), preset("paper-64x1024")
@@ -351,6 +462,44 @@ def test_on_cuda_frames_replay_a_graph_without_a_word_from_the_host(precision, y
         torch.cuda.set_sync_debug_mode(mode)
     for answer, exact in zip(answers, expected, strict=True):
         assert (answer.cpu() - exact).abs().mean() < (METRES if precision == "float32" else 0.02)
+    with pytest.raises(ValueError, match=r"scan is on cpu; it should be on cuda:\d"):
+        upsampler.ranges(scans[0])
+    with pytest.raises(ValueError, match=r"model is on cuda:\d; it should be on cpu"):
+        model.ranges(scans[0], target)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_on_cuda_threads_and_streams_share_an_upsampler(yard):
+    torch.manual_seed(0)
+    model = models.ILN(blocks=2).eval().cuda()
+    source, target = preset("paper-16x1024"), preset("paper-64x1024")
+    scans = [simulate(yard, source, pose((float(x), 0.0, 1.8))) for x in range(12)]
+    moved = [Scan(scan.ranges.cuda(), source) for scan in scans]
+    expected = [model.ranges(scan, target) for scan in moved]
+    upsampler = models.Upsampler(model, source, target, device="cuda")
+    torch.cuda.synchronize()
+
+    def ranges(scan):
+        with torch.cuda.stream(torch.cuda.Stream()):
+            answer = upsampler.ranges(scan)
+            torch.cuda.current_stream().synchronize()
+            return answer
+
+    with ThreadPoolExecutor(4) as threads:
+        for answer, exact in zip(threads.map(ranges, moved), expected, strict=True):
+            torch.testing.assert_close(answer, exact, rtol=0, atol=METRES)
+
+
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two CUDA devices")
+def test_on_cuda_a_frame_stays_on_a_device_that_is_not_the_current_one(yard):
+    model = small().to("cuda:1")
+    source, target = preset("paper-16x1024"), preset("paper-64x1024")
+    scan = simulate(yard, source, pose((0.0, 0.0, 1.8)))
+    upsampler = models.Upsampler(model, source, target, device="cuda:1")
+    moved = Scan(scan.ranges.to("cuda:1"), source)
+    answers = [upsampler.ranges(moved) for _ in range(3)]
+    exact = model.cpu().ranges(scan, target)
+    assert all((answer.cpu() - exact).abs().mean() < METRES for answer in answers)
 
 
 def test_bilinear_upsampling_is_close_to_the_truth_on_the_ground(yard):
