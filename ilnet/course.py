@@ -1,4 +1,4 @@
-"""What the notebooks of the course share: checks of exercises, and pictures."""
+"""What the notebooks share: checks of exercises, 3-D scenes, drawings of threads. Needs the extra `course`."""
 
 import io
 import os
@@ -14,21 +14,21 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 
 __all__ = ["Cells", "check", "draw_thread", "show_scene"]
 
-# Inches: of a drawing, and of an element of an array in it.
+# Inches: the width of a drawing, and the side of an array element in it.
 _WIDTH, _CELL = 9.0, 0.17
 
 
 def check(checks: Callable[[], object]) -> None:
-    """Runs the checks of an exercise at once; a decorator for the function that holds them.
+    """Runs the checks of an exercise at once. Use it as a decorator of the function that holds them.
 
-    An answer that is still to be written raises a bare NotImplementedError: that is said, and the notebook goes on.
-    What a wrong answer raises is raised, also a NotImplementedError that says what it is about, such as PyTorch's.
+    An exercise that is not answered yet raises a bare NotImplementedError. Then this prints a hint, and the notebook
+    goes on. Every other error goes through, including a NotImplementedError with a message, such as PyTorch's.
 
     Args:
-        checks: Asserts what an answer has to fulfil; it takes nothing, and what it returns is ignored.
+        checks: Asserts what the answer should fulfil. It takes no arguments, and its result is ignored.
 
     Raises:
-        AssertionError: What `checks` finds wrong; and whatever else an answer raises.
+        AssertionError: If `checks` finds something wrong. Any other error of the answer goes through as well.
     """
     try:
         checks()
@@ -41,50 +41,51 @@ def check(checks: Callable[[], object]) -> None:
 
 
 def show_scene(plotter: Any) -> HTML | Image:
-    """A PyVista plotter as something to turn with the mouse in a Jupyter session, and as a picture elsewhere.
+    """Shows a PyVista scene: in a Jupyter session one that turns with the mouse, elsewhere a picture.
 
     Args:
-        plotter: A `pyvista.Plotter` with `off_screen=True`; it is closed.
+        plotter: A `pyvista.Plotter` with `off_screen=True`. It is closed.
 
     Returns:
-        What a cell that ends with this call shows. A picture has 256 colours, so that notebooks stay small.
+        The scene as HTML, or a picture. A cell that ends with this call shows it.
     """
-    if "JPY_SESSION_NAME" in os.environ or "VSCODE_PID" in os.environ:  # somebody sits there
+    if "JPY_SESSION_NAME" in os.environ or "VSCODE_PID" in os.environ:  # a person is there to turn it
         width, height = plotter.window_size
         page = escape(plotter.trame.export_html(None).getvalue())
         plotter.close()
-        # Without a width of its own it shrinks with the page.
+        # A width in percent, so that the scene shrinks with the page.
         style = f"width: 100%; max-width: {width}px; height: {height}px; border: 0"
         return HTML(f'<div><iframe srcdoc="{page}" style="{style}"></iframe></div>')
     pixels = plotter.screenshot()
     plotter.close()
     png = io.BytesIO()
+    # 256 colours keep notebooks small.
     PIL.Image.fromarray(pixels).quantize(256, PIL.Image.Quantize.MAXCOVERAGE).save(png, "png", optimize=True)
     return Image(png.getvalue())
 
 
 class Cells(NamedTuple):
-    """An array as a kernel sees it, and the elements that one thread touches."""
+    """An array to draw, and which of its elements one thread touches."""
 
     name: str
-    """As in the kernel's signature."""
+    """The name of the array in the kernel's signature."""
     shape: tuple[int, int]
-    """Rows and columns to draw."""
+    """How many rows and columns to draw."""
     touched: Sequence[tuple[int, int]]
-    """(row, column) of each element that the thread reads or writes."""
+    """The (row, column) of each element that the thread reads or writes."""
 
 
 def draw_thread(title: str, reads: Sequence[Cells], steps: str, writes: Sequence[Cells]) -> Image:
-    """Draws what one thread of a kernel does: what it reads on the left, its steps, what it writes on the right.
+    """Draws one thread of a kernel: what it reads on the left, its steps in the middle, what it writes on the right.
 
     Args:
-        title: Which kernel, and what one thread stands for.
-        reads: Arrays it reads.
-        steps: A few short lines: what happens in registers.
-        writes: Arrays it writes.
+        title: The name of the kernel, and what one thread stands for.
+        reads: The arrays it reads.
+        steps: A few short lines that say what happens in registers.
+        writes: The arrays it writes.
 
     Returns:
-        A picture, for a cell to end with.
+        A picture. A cell that ends with this call shows it.
     """
     height = 0.3 + max(sum(_tall(cells) for cells in arrays) for arrays in (reads, writes))
     figure = Figure(figsize=(_WIDTH, height))
@@ -115,7 +116,7 @@ def _tall(cells: Cells) -> float:
 
 
 def _draw_cells(axes: Axes, cells: Cells, colour: str, x: float, top: float, side: int) -> list[tuple[float, float]]:
-    """One array as a grid below its name; returns where the touched rows meet their arrows."""
+    """Draws one array as a grid below its name; returns where the arrows of the touched rows end."""
     right, aligned = x + _CELL * cells.shape[1], "right" if side < 0 else "left"
     name_x = right if side < 0 else x
     axes.text(name_x, top - 0.12, cells.name, fontsize=9, family="monospace", va="center", ha=aligned)
@@ -125,6 +126,7 @@ def _draw_cells(axes: Axes, cells: Cells, colour: str, x: float, top: float, sid
             corner = x + _CELL * column, top - 0.25 - _CELL * (row + 1)
             here = (row, column) in cells.touched
             axes.add_patch(Rectangle(corner, _CELL, _CELL, fc=colour if here else "white", ec="#777777", linewidth=0.6))
-            if here and (side < 0 or row not in ends):  # the outermost of its row
+            # An arrow leaves the last touched cell of a row that is read, and meets the first of one that is written.
+            if here and (side < 0 or row not in ends):
                 ends[row] = corner[0] + (_CELL if side < 0 else 0), corner[1] + _CELL / 2
     return list(ends.values())

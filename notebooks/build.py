@@ -1,13 +1,17 @@
 """Writes the notebooks from their sources.
 
-python notebooks/build.py            all of them
-python notebooks/build.py 00 03      those that start so
+python notebooks/build.py            builds all of them
+python notebooks/build.py 00 03      builds those whose names start with 00 or 03
 
-A source `NN_name.py` (jupytext, py:percent) becomes two notebooks: the learner's `NN_name.ipynb`, executed, and
-`solutions/NN_name.ipynb`. Tags say which cells are whose. An exercise is a cell tagged `exercise`, which raises
-NotImplementedError, then one tagged `solution`, then one tagged `check`. Cells tagged `wrong` behind them are answers
-that the check has to refuse; only the tests run them. What the cell tagged `goal` draws becomes the picture at the head
-of the notebook and in the README, `pictures/NN_name.png`.
+A source `NN_name.py` (jupytext, py:percent) becomes two notebooks: `NN_name.ipynb` for the learner, executed, and
+`solutions/NN_name.ipynb`. Cells are told apart by their tags. An exercise has four kinds, in this order:
+
+- `exercise`: a stub that raises NotImplementedError;
+- `solution`: folded away in the learner's notebook;
+- `check`: asserts that an answer is right;
+- `wrong`: one or more answers that the check should refuse. Only the tests run them.
+
+One cell is tagged `goal`. Its picture becomes `pictures/NN_name.png`, which the head of the notebook and the README show.
 """
 
 import base64
@@ -24,7 +28,7 @@ from nbclient import NotebookClient
 from nbformat import NotebookNode
 
 HERE = Path(__file__).parent
-TIMEOUT = 600  # seconds a cell, where other things run as well
+TIMEOUT = 600  # seconds for one cell, on a machine that is busy with other work
 PICTURE_WIDTH = 640  # pixels
 WIDGET = "application/vnd.jupyter.widget-view+json"
 
@@ -34,7 +38,7 @@ def tagged(cell: NotebookNode, tag: str) -> bool:
 
 
 def exercises(source: Path) -> list[dict[str, list[NotebookNode]]]:
-    """The cells of a source in order, each run of exercise cells as one dictionary by tag."""
+    """Returns the cells of a source in order: one dictionary by tag for each exercise, and for each other cell."""
     groups: list[dict[str, list[NotebookNode]]] = []
     for cell in jupytext.read(source).cells:
         tag = next((t for t in ("exercise", "solution", "check", "wrong") if tagged(cell, t)), "text")
@@ -45,7 +49,7 @@ def exercises(source: Path) -> list[dict[str, list[NotebookNode]]]:
 
 
 def learner(source: Path) -> NotebookNode:
-    """The notebook with stubs to fill in, each solution folded behind its check."""
+    """Returns the notebook with stubs to fill in. Each solution is folded below its check."""
     cells = []
     for group in exercises(source):
         cells += group["text"] + group["exercise"] + group["check"]
@@ -57,12 +61,12 @@ def learner(source: Path) -> NotebookNode:
 
 
 def solved(source: Path) -> NotebookNode:
-    """The notebook with the solutions in."""
+    """Returns the notebook with its solutions in place of the stubs."""
     return notebook(source, [c for g in exercises(source) for c in g["text"] + g["solution"] + g["check"]])
 
 
 def proof(source: Path) -> NotebookNode:
-    """The solved notebook in which each check, once passed, meets its wrong answers, and then the solution again."""
+    """Returns the solved notebook in which each check also meets its wrong answers, and then the solution again."""
     cells = []
     for group in exercises(source):
         cells += group["text"] + group["solution"] + group["check"]
@@ -79,7 +83,7 @@ def notebook(source: Path, cells: list[NotebookNode]) -> NotebookNode:
     made = jupytext.read(source)
     made.cells = cells
     for number, cell in enumerate(cells):
-        cell.id = f"cell-{number}"  # not random, so that two builds agree
+        cell.id = f"cell-{number}"  # not random, so that two builds are equal
     made.metadata.pop("jupytext", None)
     return made
 
@@ -90,10 +94,11 @@ def execute(made: NotebookNode, folder: str) -> None:
         timeout=TIMEOUT,
         kernel_name="python3",
         resources={"metadata": {"path": folder}},
-        record_timing=False,  # nor differ in times, nor in how what was printed falls into pieces
+        # Two builds should not differ in times, or in how printed text is split into outputs.
+        record_timing=False,
         coalesce_streams=True,
     ).execute()
-    # Sliders work where a kernel runs; on paper they are an error message.
+    # Sliders need a running kernel. In a stored notebook they show an error message.
     made.metadata.pop("widgets", None)
     for cell in made.cells:
         if cell.cell_type == "code":
@@ -101,7 +106,7 @@ def execute(made: NotebookNode, folder: str) -> None:
 
 
 def draw_goal(made: NotebookNode, file: Path) -> None:
-    """Writes what the cell tagged `goal` of an executed notebook drew."""
+    """Writes the picture that the cell tagged `goal` of an executed notebook drew."""
     [cell] = [cell for cell in made.cells if tagged(cell, "goal")]
     [drawn] = [output.data["image/png"] for output in cell.outputs if "image/png" in output.get("data", {})]
     picture = PIL.Image.open(io.BytesIO(base64.b64decode(drawn))).convert("RGB")
@@ -113,7 +118,7 @@ def draw_goal(made: NotebookNode, file: Path) -> None:
 
 def build(source: Path) -> None:
     made = learner(source)
-    with tempfile.TemporaryDirectory() as folder:  # a notebook may not rely on where it lies
+    with tempfile.TemporaryDirectory() as folder:  # a notebook should run from any folder
         execute(made, folder)
     nbformat.write(made, source.with_suffix(".ipynb"))
     draw_goal(made, HERE / "pictures" / f"{source.stem}.png")
