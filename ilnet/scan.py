@@ -10,7 +10,7 @@ import torch
 
 from ilnet.sensor import Sensor, directions_to_angles
 
-__all__ = ["Scan", "real_tensor"]
+__all__ = ["Pair", "Scan", "real_tensor"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +64,11 @@ class Scan:
             )
         object.__setattr__(self, "intensity", intensity.where(ranges > 0, 0.0))
 
+    def to(self, device: torch.device | str) -> "Scan":
+        """Returns the scan, with its intensity, on a device."""
+        intensity = None if self.intensity is None else self.intensity.to(device)
+        return Scan(self.ranges.to(device), self.sensor, intensity)
+
     def points(self) -> torch.Tensor:
         """Return the returns as points (N, 3) float32 [m], sensor frame, row by row."""
         directions = self.sensor.directions().to(self.ranges.device)
@@ -81,7 +86,8 @@ class Scan:
 
     def decimate(self, rows: int | None = None, columns: int | None = None) -> "Scan":
         """Return the scan of only some of the beams and columns; see `Sensor.decimation`."""
-        row_index, column_index = (torch.from_numpy(index) for index in self.sensor.decimation(rows, columns))
+        indices = self.sensor.decimation(rows, columns)
+        row_index, column_index = (torch.from_numpy(index).to(self.ranges.device) for index in indices)
         intensity = None if self.intensity is None else self.intensity[row_index][:, column_index]
         return Scan(self.ranges[row_index][:, column_index], self.sensor.decimate(rows, columns), intensity)
 
@@ -120,6 +126,10 @@ class Scan:
         ranges = torch.full((height * width,), torch.inf, device=points.device)
         ranges.scatter_reduce_(0, row * width + column, distance[in_view].float(), "amin")
         return cls(ranges.masked_fill(ranges.isinf(), 0.0).view(height, width), sensor)
+
+
+# The scan that a model sees, and the scan that it should predict.
+Pair = tuple[Scan, Scan]
 
 
 def real_tensor(name: str, value: object) -> torch.Tensor:

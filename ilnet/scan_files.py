@@ -191,8 +191,7 @@ def _read_pcd(path: Path, sensor: Sensor | None) -> Scan:
 def _required(sensor: Sensor | None) -> Sensor:
     if sensor is None:
         raise ValueError(
-            "it does not say its sensor: name one (--sensor os1-128, in upsample --from os1-128, "
-            "in Python sensor=preset('os1-128'))"
+            "it does not hold the angles of its rays; name the sensor that measured it, such as the preset os1-128"
         )
     return sensor
 

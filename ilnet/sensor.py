@@ -9,12 +9,23 @@ Radians and metres everywhere in Python; degrees stand only in files and in the 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-__all__ = ["PRESETS", "Sensor", "angles_to_directions", "directions_to_angles", "preset"]
+__all__ = [
+    "PAPER_INPUT",
+    "PAPER_TARGET",
+    "PRESETS",
+    "Sensor",
+    "angles_to_directions",
+    "directions_to_angles",
+    "format_size",
+    "parse_size",
+    "preset",
+]
 
 
 def angles_to_directions(elevation: torch.Tensor, azimuth: torch.Tensor) -> torch.Tensor:
@@ -114,9 +125,8 @@ class Sensor:
 
     def __repr__(self) -> str:
         e, a = np.rad2deg(self.elevations), np.rad2deg(self.azimuths)
-        rows, columns = self.shape
         return (
-            f"Sensor({self.name or 'unnamed'}, {rows}x{columns}, elevations {e[0]:.2f}..{e[-1]:.2f} deg, "
+            f"Sensor({self.name or 'unnamed'}, {self.size}, elevations {e[0]:.2f}..{e[-1]:.2f} deg, "
             f"azimuths {a[0]:.2f}..{a[-1]:.2f} deg, {self.min_range:g}..{self.max_range:g} m)"
         )
 
@@ -124,6 +134,11 @@ class Sensor:
     def shape(self) -> tuple[int, int]:
         """Rows and columns of its range images, (H, W)."""
         return len(self.elevations), len(self.azimuths)
+
+    @property
+    def size(self) -> str:
+        """Rows and columns as text, such as "16x1024"; see `parse_size`."""
+        return format_size(self.shape)
 
     @property
     def wrap(self) -> bool:
@@ -232,6 +247,24 @@ class Sensor:
         return replace(self, elevations=elevations, azimuths=azimuths, name="")
 
 
+def format_size(shape: Sequence[int]) -> str:
+    """Returns rows and columns as text, such as "16x1024"."""
+    rows, columns = shape
+    return f"{rows}x{columns}"
+
+
+def parse_size(size: str) -> tuple[int, int]:
+    """Returns the rows and columns that a text such as "16x1024" names.
+
+    Raises:
+        ValueError: If it is anything else, or names fewer than 2 of either.
+    """
+    rows, _, columns = size.partition("x")
+    if not (rows.isdecimal() and columns.isdecimal() and int(rows) >= 2 and int(columns) >= 2):
+        raise ValueError(f"size is {size!r}; it should be rows x columns, at least 2 of each, such as 64x1024")
+    return int(rows), int(columns)
+
+
 def _table(name: str, value: object) -> np.ndarray:
     """Return a private float64 copy of a table of finite angles."""
     if isinstance(value, torch.Tensor):
@@ -320,3 +353,9 @@ def preset(name: str) -> Sensor:
     if name not in PRESETS:
         raise ValueError(f"unknown sensor {name!r}; known are {', '.join(PRESETS)}")
     return PRESETS[name]
+
+
+PAPER_INPUT = preset("paper-16x1024")
+"""What the paper's networks see."""
+PAPER_TARGET = preset("paper-128x2048")
+"""What they learn to predict from stored images."""

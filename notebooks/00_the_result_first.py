@@ -59,12 +59,12 @@ device = "cuda" if torch.cuda.is_available() else "cpu"
 # with 128 × 2048 rays at the same place: the truth.
 
 # %%
-street = places.street("town10", device=device)
+street = places.town("town10", device=device)
 pose = street.pose(1400)  # (4, 4): where on the street the sensor is, and where it looks
 world = street.world(pose[:3, 3], seed=1400)  # what stands around there, with cars and people of that seed
 
-sparse = simulate.simulate(world, preset("paper-16x1024"), pose)
-truth = simulate.simulate(world, preset("paper-128x2048"), pose)
+sparse = simulate.scan(world, preset("paper-16x1024"), pose)
+truth = simulate.scan(world, preset("paper-128x2048"), pose)
 print("measured:", tuple(sparse.ranges.shape), " wanted:", tuple(truth.ranges.shape))
 
 # %% [markdown]

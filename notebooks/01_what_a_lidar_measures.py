@@ -238,10 +238,10 @@ print("all rays:", tuple(rays.shape), " ray (row 4, column 512):", [round(x, 3) 
 # belong to.
 
 # %%
-street = places.street("town01", device=device)
+street = places.town("town01", device=device)
 pose = street.pose(1445)  # (4, 4), sensor frame to town
 world = street.world(pose[:3, 3], seed=0)  # the town, and cars and people
-scan = simulate.simulate(world, paper, pose)
+scan = simulate.scan(world, paper, pose)
 
 print(scan.sensor)
 print("ranges:", tuple(scan.ranges.shape), scan.ranges.dtype)
@@ -456,8 +456,8 @@ print(
 # %%
 turned = simulate.pose(pose[:3, 3], yaw=math.atan2(pose[1, 0], pose[0, 0]) - math.radians(24))
 coarse, fine = preset("paper-64x1024").resize(64, 64), preset("paper-64x1024").resize(64, 4096)
-measured = simulate.simulate(world, coarse, turned).filled().cpu().numpy()
-truth = simulate.simulate(world, fine, turned).filled().cpu().numpy()
+measured = simulate.scan(world, coarse, turned).filled().cpu().numpy()
+truth = simulate.scan(world, fine, turned).filled().cpu().numpy()
 
 closed_table = np.append(coarse.azimuths, coarse.azimuths[0] + math.tau)  # 65 azimuths, the last one a turn later
 closed_image = np.append(measured, measured[:, :1], axis=1)
@@ -631,7 +631,7 @@ plt.show()
 # Here is the same cloud, and that of a sensor with 128 beams. In a Jupyter session you can turn it with the mouse.
 
 # %%
-dense = simulate.simulate(world, preset("paper-128x2048"), pose)
+dense = simulate.scan(world, preset("paper-128x2048"), pose)
 plotter = pyvista.Plotter(off_screen=True, shape=(1, 2), window_size=(1000, 420), border=False)
 for number, shot in enumerate((scan, dense)):
     plotter.subplot(0, number)
@@ -816,7 +816,7 @@ assert torch.allclose(again, scan.ranges, atol=1e-3)
 shifted = Scan.from_points(moved, paper).ranges
 there = pose.clone()
 there[:3, 3] += 3 * pose[:3, 0]  # 3 m along the sensor's x axis
-new_truth = simulate.simulate(world, paper, there).ranges
+new_truth = simulate.scan(world, paper, there).ranges
 
 figure, pair = plt.subplots(2, 1, figsize=(11, 3.6), sharex=True, layout="constrained")
 for axes, (name, answer) in zip(

@@ -1045,7 +1045,7 @@ draw_thread(
 # %%
 project_mesh = Mesh(vertices, triangles, device)
 hits = project_mesh.cast(torch.zeros(3, device=device), rays, sensor.max_range)
-scan = simulate.simulate(project_mesh, sensor, pose)
+scan = simulate.scan(project_mesh, sensor, pose)
 
 for name, ranges in (("Mesh.cast", hits.range), ("simulate", scan.ranges.view(-1))):
     differ = ((ranges - mine).abs() > 0.01).sum()
@@ -1091,7 +1091,7 @@ assert abs(road - sine) < 0.03
 #
 # On a level road the cosine is the sine of the angle below the horizon: 0.12 at 7°. Two neighbouring beams touch such a
 # surface eight times as far apart as on a wall that faces us. Grazing rays are also those that a real sensor gets no
-# answer from; `simulate.Effects` has that, and noise, wide beams and a moving sensor besides.
+# answer from; `ilnet.world.effects.Effects` has that, and noise, wide beams and a moving sensor besides.
 #
 # What the sensor saw of the town: the triangles that were hit, and the points on them. In a Jupyter session, turn it.
 

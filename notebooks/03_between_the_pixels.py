@@ -52,12 +52,12 @@ COLOURS = {"bilinear": "#999999", "perspective": "#e69f00", "truth": "black"}
 # ask for any other ray.
 
 # %%
-street = places.street("town01", device=device)
+street = places.town("town01", device=device)
 WAYPOINT = 1445
 sensor = preset("paper-16x1024")
 pose = street.pose(WAYPOINT)
 world = street.world(pose[:3, 3], seed=0)
-scan = simulate.simulate(world, sensor, pose)
+scan = simulate.scan(world, sensor, pose)
 image = scan.filled()  # (16, 1024) metres; no return becomes 100 m, as the networks see it
 
 

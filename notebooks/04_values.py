@@ -202,7 +202,7 @@ print(f"{sum(p.numel() for p in LIIF().parameters()):,} parameters")
 # meets nothing has the target 100 m, as in `filled()`.
 
 # %% tags=["goal"]
-streets = [places.street(name, device=device) for name in ("town01", "town02")]
+streets = [places.town(name, device=device) for name in ("town01", "town02")]
 SENSOR = preset("paper-16x1024")
 batch = next(iter(data.ContinuousRays(streets, SENSOR, crops=4, columns=64, queries=384, seed=0)))
 print("images ", tuple(batch.image.shape), "queries", tuple(batch.queries.shape), "ranges", tuple(batch.ranges.shape))
@@ -234,7 +234,7 @@ plt.show()
 # A place of another town, with its own traffic, seen by three sensors. The third is for section 5: it has a row half
 # way between two of ours, and sixteen columns for each of ours.
 sensors = [SENSOR, preset("paper-64x1024"), SENSOR.resize(31, 16 * 1024)]
-[(scan, truth, close)] = places.held_out_scans(places.street("town05", device=device), 1, sensors)
+[(scan, truth, close)] = places.held_out_scans(places.town("town05", device=device), 1, sensors)
 image = scan.filled()[None]  # (1, 16, 1024)
 queries = SENSOR.grid_queries(truth.sensor).view(1, -1, 2).to(device)  # every pixel of the 64 x 1024 image
 

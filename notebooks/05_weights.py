@@ -161,7 +161,7 @@ def softmax_blend(r, s):
 
 # %%
 SENSOR = preset("paper-16x1024")
-pairs = places.held_out_scans(places.street("town05", device=device), 1, [SENSOR, preset("paper-64x1024")])
+pairs = places.held_out_scans(places.town("town05", device=device), 1, [SENSOR, preset("paper-64x1024")])
 scan, truth = pairs[0]
 image = scan.filled()[None]  # (1, 16, 1024)
 queries = SENSOR.grid_queries(truth.sensor).view(1, -1, 2).to(device)  # every pixel of the 64 x 1024 image
@@ -301,7 +301,7 @@ def score_gradient(r, s):
 # notebook 04)?
 
 # %%
-streets = [places.street(name, device=device) for name in ("town01", "town02")]
+streets = [places.town(name, device=device) for name in ("town01", "town02")]
 rays = data.ContinuousRays(streets, SENSOR, crops=4, columns=64, queries=384, seed=0)
 batches = list(islice(rays, STEPS))  # drawn once: all three see the very same
 

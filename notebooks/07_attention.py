@@ -760,7 +760,7 @@ for name, values in clock.items():
 STEPS = 30 if FAST else 300
 SEEDS = 0, 1
 coarse, fine = preset("paper-16x1024"), preset("paper-64x1024")
-town = places.street("town01", device=device)
+town = places.town("town01", device=device)
 rays = iter(data.ContinuousRays([town], coarse, crops=2, columns=48, queries=256, seed=0))
 batches = [next(rays) for _ in range(STEPS)]
 [(scan, truth)] = places.held_out_scans(town, 1, [coarse, fine])

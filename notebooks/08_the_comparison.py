@@ -47,7 +47,7 @@ import ilnet
 from ilnet import data, metrics, models, places, simulate, towns
 from ilnet.commands.experiment import PAPER
 from ilnet.course import check, show_scene
-from ilnet.learning.evaluate import INPUT
+from ilnet.sensor import PAPER_INPUT as INPUT
 from kernels import Mesh
 
 FAST = True  # False: ten times the steps, and more scans
@@ -271,7 +271,7 @@ def voxel_iou(predicted, true, low, high):  # divides by zero
 # %%
 SCANS = 4 if FAST else 10  # from each town
 FINE, FINEST = INPUT.resize(64, 1024), INPUT.resize(128, 2048)
-streets = {name: places.street(name, device=device) for name in towns.TEST}
+streets = {name: places.town(name, device=device) for name in towns.TEST}
 scans = [
     triple for street in streets.values() for triple in places.held_out_scans(street, SCANS, [INPUT, FINE, FINEST])
 ]
@@ -388,7 +388,7 @@ show_scene(plotter)
 # ## 3. The table
 #
 # All methods, on the same scans. (`bilinear-inverse` is the *perspective* blend of notebook 03.) `python -m ilnet
-# evaluate` and `ilnet.learning.evaluate.evaluate` do the same and return the means; we keep the figures of every scan, since we
+# evaluate` and `ilnet.learning.evaluate.measure` do the same and return the means; we keep the figures of every scan, since we
 # want to look at their spread. A `models.Upsampler` prepares once what all scans have in common.
 #
 # If you have trained weights of your own, name their file in `OWN` at the top, and they stand in the table. A minute or
@@ -636,8 +636,8 @@ def paired_difference(one, other):  # zero instead of unknown
 # %%
 STEPS = 100 if FAST else 1000
 SECTOR = replace(FINE, azimuths=FINE.azimuths[384:640])
-validation = places.held_out_scans(places.street("town01", seed=1, device=device), 3, [INPUT, SECTOR])
-rays = iter(data.ContinuousRays([places.street("town01", device=device)], INPUT, 4, 64, 512, seed=0))
+validation = places.held_out_scans(places.town("town01", seed=1, device=device), 3, [INPUT, SECTOR])
+rays = iter(data.ContinuousRays([places.town("town01", device=device)], INPUT, 4, 64, 512, seed=0))
 batches = [next(rays) for _ in range(STEPS)]
 
 
@@ -824,12 +824,12 @@ def spread(half, rows=16):
 def pair(world, pose, half, rows=64):
     """One pair: 16 beams over ± `half` degrees, and `rows` beams over the same, 90 degrees of them."""
     dense = replace(SECTOR, elevations=spread(half, rows).elevations)
-    return [simulate.simulate(world, sensor, pose) for sensor in (spread(half), dense)]
+    return [simulate.scan(world, sensor, pose) for sensor in (spread(half), dense)]
 
 
 places = []  # (world, pose) in both test towns
 for street in streets.values():
-    for number in (len(street.town.waypoints) // 3, 2 * len(street.town.waypoints) // 3):
+    for number in (len(street.waypoints) // 3, 2 * len(street.waypoints) // 3):
         pose = street.pose(number)
         places.append((street.world(pose[:3, 3], number), pose))
 inside = hall()

@@ -48,7 +48,8 @@ import ilnet.scan_files
 from ilnet import data, evaluate, metrics, models, places, simulate
 from ilnet.course import check, show_scene
 from ilnet.scan import Scan
-from ilnet.sensor import PRESETS, Sensor, preset
+from ilnet.sensor import PAPER_INPUT, PRESETS, Sensor, preset
+from ilnet.world.effects import Effects
 from kernels import Mesh
 
 FAST = True  # False: ten times the steps of the training at the end
@@ -205,12 +206,12 @@ def own_sensor(beams_deg, columns, clockwise, low, high):  # the last column rep
 # beams. What becomes of a level road?
 
 # %%
-street = places.street("town10", device=device)  # a test town: no network was trained in it
-waypoint = len(street.town.waypoints) // 3
+street = places.town("town10", device=device)  # a test town: no network was trained in it
+waypoint = len(street.waypoints) // 3
 pose = street.pose(waypoint)
 world = street.world(pose[:3, 3], waypoint)
 
-whole = simulate.simulate(world, uneven, pose)
+whole = simulate.scan(world, uneven, pose)
 kept = whole.decimate(16)  # each row with its own angle
 even = np.linspace(uneven.elevations[0], uneven.elevations[-1], 16)
 mislabelled = Scan(kept.ranges, replace(kept.sensor, elevations=even))
@@ -328,7 +329,7 @@ def keep(scan, rows):  # the first so many
 # ## 3. A file
 #
 # No measured scan comes with this package. So we write the files that a driver would: a scan of a moving car, with what
-# a real sensor does to it. `simulate.Effects` knows range noise, returns lost on grazing and far surfaces, beams as
+# a real sensor does to it. `Effects` knows range noise, returns lost on grazing and far surfaces, beams as
 # wide as 3 mrad, intensities, and a car that drives 10 m/s and turns while the head turns. If you have a scan of your
 # own, name it in `FILE` at the top and run on: section 4 and `dense.ply` in section 5 take yours.
 #
@@ -345,7 +346,7 @@ def keep(scan, rows):  # the first so many
 
 # %%
 measuring = replace(preset("os1-64"), min_range=1.0, max_range=80.0, norm_range=100.0)  # we trust it up to 80 m
-effects = simulate.Effects(
+effects = Effects(
     range_noise=0.02,  # m
     dropout_range=0.3,  # probability at the maximum range
     dropout_incidence=0.5,  # probability at a grazing surface
@@ -354,7 +355,7 @@ effects = simulate.Effects(
     velocity=(10.0, 0.0, 0.0),  # m/s
     angular_velocity=(0.0, 0.0, 0.3),  # rad/s
 )
-frame = simulate.simulate(world, measuring, pose, effects, seed=0)
+frame = simulate.scan(world, measuring, pose, effects, seed=0)
 
 ilnet.scan_files.write(folder / "frame.npz", frame)  # whole and without loss
 np.save(folder / "frame.npy", frame.ranges.cpu().numpy())
@@ -580,7 +581,7 @@ frames = models.Upsampler(loaded["iln-prior"], thinned, target, device=device)
 for number in range(3):  # the car drives on, a metre each frame
     ahead = pose.clone()
     ahead[:3, 3] += number * pose[:3, 0]
-    scan = simulate.simulate(world, thinned, ahead, effects, seed=number)
+    scan = simulate.scan(world, thinned, ahead, effects, seed=number)
     path = folder / f"frame-{number}.ply"
     ilnet.scan_files.write(path, frames(scan))
     print(f"{path.name}: {path.stat().st_size / 2**20:.1f} MiB")
@@ -599,8 +600,8 @@ for number in range(3):  # the car drives on, a metre each frame
 # to the IoU of LIIF, and of `planes`?
 
 # %%
-clean = simulate.simulate(world, evaluate.INPUT, pose)
-full = simulate.simulate(world, evaluate.INPUT.resize(64, 1024), pose)
+clean = simulate.scan(world, PAPER_INPUT, pose)
+full = simulate.scan(world, PAPER_INPUT.resize(64, 1024), pose)
 luck = torch.rand(clean.ranges.shape, generator=torch.Generator().manual_seed(0)).to(device)
 shares = (0.0, 0.05, 0.2)
 
@@ -659,10 +660,10 @@ halves = (15, 22.5, 30, 45)
 
 def heights(name, half):
     """Heights [m] above the plane, and distances, of predicted points 6 degrees and more below the horizon."""
-    source = replace(evaluate.INPUT, elevations=np.deg2rad(np.linspace(-half, half, 16)))
+    source = replace(PAPER_INPUT, elevations=np.deg2rad(np.linspace(-half, half, 16)))
     fine = np.deg2rad(np.linspace(-half, -6, 80))
     asked = replace(source, elevations=fine, azimuths=source.azimuths[500:524])
-    scan = simulate.simulate(level, source, simulate.pose((0, 0, 1.8)))
+    scan = simulate.scan(level, source, simulate.pose((0, 0, 1.8)))
     points = loaded[name].ranges(scan, asked)[..., None] * asked.directions().to(device)
     return (points[..., 2] + 1.8).cpu(), points[..., :2].norm(dim=-1).cpu()
 
@@ -794,11 +795,11 @@ def is_mirrored(before, after, turned):
 def _():
     before = full.ranges.cpu()
     turns = {
-        turned: simulate.pose(pose[:3, 3], float(street.town.headings[waypoint]) + turned * 2 * math.pi / 1024)
+        turned: simulate.pose(pose[:3, 3], float(street.headings[waypoint]) + turned * 2 * math.pi / 1024)
         for turned in (20, -45)
     }
     for turned, turned_pose in turns.items():
-        after = simulate.simulate(world, full.sensor, turned_pose).ranges.cpu()
+        after = simulate.scan(world, full.sensor, turned_pose).ranges.cpu()
         found = is_mirrored(before, after, turned)
         assert isinstance(found, bool), f"a Python bool is wanted, not {type(found).__name__}: bool(...)"
         side = "left" if turned > 0 else "right"
@@ -890,8 +891,8 @@ def is_mirrored(before, after, turned):  # asks only whether it was turned at al
 # **Predict:** where in the image does that show, and is it a problem for upsampling?
 
 # %%
-moving = simulate.Effects(velocity=(20.0, 0.0, 0.0))
-at_rest, skewed = (simulate.simulate(world, measuring, pose, some) for some in (None, moving))
+moving = Effects(velocity=(20.0, 0.0, 0.0))
+at_rest, skewed = (simulate.scan(world, measuring, pose, some) for some in (None, moving))
 skew_iou = {}
 for label, scan in (("at rest", at_rest), ("20 m/s", skewed)):
     skew_iou[label] = metrics.compare(loaded["iln-prior"].ranges(scan.decimate(16), measuring), scan)["iou"]
@@ -930,7 +931,7 @@ plt.show()
 # %%
 STEPS = 40 if FAST else 400
 upright = replace(thinned, elevations=np.sort(thinned.elevations), azimuths=np.sort(thinned.azimuths))
-places = [places.street(name, device=device) for name in ("town01", "town03")]
+places = [places.town(name, device=device) for name in ("town01", "town03")]
 batches = iter(data.ContinuousRays(places, upright, crops=4, columns=64, queries=512, seed=0))
 tuned = models.load("iln-prior").to(device).train()
 optimizer = torch.optim.Adam(tuned.parameters(), lr=2e-4)
@@ -947,9 +948,9 @@ for _ in range(STEPS):
     optimizer.step()
 
 # %%
-another = 2 * len(street.town.waypoints) // 3  # another place in the test town
+another = 2 * len(street.waypoints) // 3  # another place in the test town
 pose_there = street.pose(another)
-there = simulate.simulate(street.world(pose_there[:3, 3], another), measuring, pose_there, effects, seed=1)
+there = simulate.scan(street.world(pose_there[:3, 3], another), measuring, pose_there, effects, seed=1)
 tried = {"iln-prior": loaded["iln-prior"], f"after {STEPS} steps": tuned.eval(), "planes": loaded["planes"]}
 better = {}
 for name, model in tried.items():

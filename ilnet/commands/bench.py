@@ -29,14 +29,14 @@ from ilnet.commands import demo
 from ilnet.learning import train as training
 from ilnet.models.base import OFFSET_SCALE, normalised
 from ilnet.scan import Scan
-from ilnet.sensor import Sensor, preset
+from ilnet.sensor import PAPER_INPUT, PAPER_TARGET, Sensor, preset
 from ilnet.world import places, simulate
 from ilnet.world.simulate import best_device
 from kernels import area_blend, gather_blend, neighbour_attention, project_pixels, reference
 
 __all__ = ["SECTIONS", "Row", "bench", "peak_memory", "table"]
 
-INPUT, OUTPUT, LARGE = "paper-16x1024", "paper-128x2048", (256, 4096)
+LARGE = (256, 4096)
 TOWN = "town01"
 # Queries of an op: those of a frame, and a quarter of it where each has 4 tokens of 64 numbers.
 BLENDS, TOKENS = 262_144, 65_536
@@ -131,7 +131,7 @@ def ops() -> Iterator[Row]:
     """The fused ops beside plain PyTorch."""
     device = best_device()
     torch.manual_seed(0)
-    source, target = preset(INPUT), preset(OUTPUT)
+    source, target = PAPER_INPUT, PAPER_TARGET
     queries = source.grid_queries(target).view(1, -1, 2).to(device)
     image = (torch.rand(1, *source.shape, device=device) * 70 + 3).requires_grad_()
     scores = torch.randn(1, BLENDS, 4, device=device, requires_grad=True)
@@ -263,8 +263,8 @@ def frame() -> Iterator[Row]:
     torch.manual_seed(0)
     model = models.ILN().eval().to(device)
     scan, _ = demo.from_town()
-    scan = Scan(scan.ranges.to(device), scan.sensor)
-    source, target = scan.sensor, preset(OUTPUT)
+    scan = scan.to(device)
+    source, target = scan.sensor, PAPER_TARGET
     for precision in models.PRECISIONS:
         for wanted in (target, target.resize(*LARGE)):
             whole = wanted is target  # the large one whole would take 6 GB
@@ -276,7 +276,7 @@ def frame() -> Iterator[Row]:
             upsampler = models.Upsampler(model, source, wanted, precision, device)
             ours = partial(_frame, upsampler, scan)
             peak = peak_memory(ours, device)
-            size = "{}x{} -> {}x{}".format(*source.shape, *wanted.shape)
+            size = f"{source.size} -> {wanted.size}"
             plain = {
                 words: _no_gradients(partial(_plain_frame, model, image, queries, chunk))
                 for words, chunk in chunks.items()
@@ -295,7 +295,7 @@ def train() -> Iterator[Row]:
     device = best_device()
     torch.manual_seed(0)
     model = models.ILN().train().to(device)
-    source = preset(INPUT)
+    source = PAPER_INPUT
     image = torch.rand(TRAIN_SCANS, *source.shape, device=device) * 70 + 3
     size = torch.tensor([source.shape[0] - 1, source.shape[1]], device=device)
     queries = torch.rand(TRAIN_SCANS, TRAIN_QUERIES, 2, device=device) * size
@@ -328,8 +328,8 @@ def train() -> Iterator[Row]:
 def _draw_batches(model: models.ILN, optimizer: torch.optim.Optimizer, device: torch.device) -> Iterator[Row]:
     """What it takes to draw a batch of continuous rays, beside the step of training that it is for."""
     size = training.PRESETS["tiny"]
-    street = places.street(TOWN, 0, device)
-    rays = data.ContinuousRays([street], preset(INPUT), size.crops, size.columns, size.queries, seed=0)
+    place = places.town(TOWN, 0, device)
+    rays = data.ContinuousRays([place], PAPER_INPUT, size.crops, size.columns, size.queries, seed=0)
     batches = iter(rays)
     batch = next(batches)
     image, queries, truth = (tensor.to(device) for tensor in (batch.image, batch.queries, batch.ranges))
@@ -360,36 +360,36 @@ def _draw_batches(model: models.ILN, optimizer: torch.optim.Optimizer, device: t
 def rays() -> Iterator[Row]:
     """Scans cast in a town, beside Open3D's and embreex's rays where these are installed."""
     device = best_device()
-    street = places.street(TOWN, 0, device)
-    poses = torch.stack([street.pose(number) for number in range(0, 100 * SCANS[device.type], 100)])
-    for sensor in (preset("paper-64x1024"), preset(OUTPUT), preset(OUTPUT).resize(*LARGE)):
-        size = "{} x {}x{}, {:.0f}k triangles".format(len(poses), *sensor.shape, len(street.town.triangles) / 1000)
-        cast = partial(_cast, street, sensor, poses)
+    place = places.town(TOWN, 0, device)
+    poses = torch.stack([place.pose(number) for number in range(0, 100 * SCANS[device.type], 100)])
+    for sensor in (preset("paper-64x1024"), PAPER_TARGET, PAPER_TARGET.resize(*LARGE)):
+        size = f"{len(poses)} x {sensor.size}, {len(place.triangles) / 1000:.0f}k triangles"
+        cast = partial(_cast, place, sensor, poses)
         alone: dict[str, Work] = {"the same BVH on one core, as Warp launches it": partial(_on_one_core, cast)}
         if device.type == "cuda":
-            yield from _compare("rays-bvh", size, cast, _embree(street, sensor, poses), repeat=3)
+            yield from _compare("rays-bvh", size, cast, _embree(place, sensor, poses), repeat=3)
             continue
         yield from _compare("rays-bvh", size, cast, alone)
-        project = partial(_project, street, sensor, poses)
+        project = partial(_project, place, sensor, poses)
         yield from _compare("rays-projection", size, project, {"our BVH on all cores": cast, **alone})
-        yield from _compare("rays-projection", size, project, _embree(street, sensor, poses), repeat=5)
+        yield from _compare("rays-projection", size, project, _embree(place, sensor, poses), repeat=5)
 
 
-def _cast(street: places.Street, sensor: Sensor, poses: torch.Tensor) -> list[torch.Tensor]:
-    return [simulate.cast(street.mesh, poses, sensor.directions().view(-1, 3), sensor.max_range)]
+def _cast(place: places.Place, sensor: Sensor, poses: torch.Tensor) -> list[torch.Tensor]:
+    return [simulate.cast(place.mesh, poses, sensor.directions().view(-1, 3), sensor.max_range)]
 
 
-def _project(street: places.Street, sensor: Sensor, poses: torch.Tensor) -> list[torch.Tensor]:
+def _project(place: places.Place, sensor: Sensor, poses: torch.Tensor) -> list[torch.Tensor]:
     tables = torch.tensor(sensor.elevations), torch.tensor(sensor.azimuths)
-    return [street.mesh.project(pose, *tables, sensor.max_range) for pose in poses]
+    return [place.mesh.project(pose, *tables, sensor.max_range) for pose in poses]
 
 
-def _embree(street: places.Street, sensor: Sensor, poses: torch.Tensor) -> dict[str, Work]:
+def _embree(place: places.Place, sensor: Sensor, poses: torch.Tensor) -> dict[str, Work]:
     """The same rays by other libraries, for those that are installed; they are given the rays ready-made."""
     directions = (sensor.directions().view(-1, 3).double() @ poses[:, :3, :3].mT).float()
     origins = poses[:, None, :3, 3].float().expand_as(directions)
     rays = torch.cat((origins, directions), 2).view(-1, 6).numpy()
-    vertices, triangles = street.town.vertices, street.town.triangles
+    vertices, triangles = place.vertices, place.triangles
     found: dict[str, Work] = {}
     with contextlib.suppress(ImportError):
         import open3d

@@ -20,10 +20,12 @@ class _Size(click.ParamType):
 
     def convert(self, value: Any, parameter: click.Parameter | None, context: click.Context | None) -> tuple[int, int]:
         """Returns both numbers."""
-        rows, _, columns = str(value).partition("x")
-        if not (rows.isdecimal() and columns.isdecimal() and int(rows) >= 2 and int(columns) >= 2):
-            self.fail(f"{value!r} should be rows x columns, at least 2 of each, such as 128x2048", parameter, context)
-        return int(rows), int(columns)
+        from ilnet.sensor import parse_size
+
+        try:
+            return parse_size(str(value))
+        except ValueError as error:
+            self.fail(str(error), parameter, context)
 
 
 # The commands import what they need themselves, so that `--help` and a typing error answer at once.
@@ -63,9 +65,10 @@ def demo(
         raise click.UsageError("--rows and --sensor go with --scan FILE")
     from ilnet.commands import demo as demonstration
     from ilnet.learning import evaluate
+    from ilnet.sensor import PAPER_TARGET
 
     if mesh and at:
-        [pair], source = evaluate.mesh_pairs(mesh, [at], demonstration.OUTPUT), mesh.name
+        [pair], source = evaluate.mesh_pairs(mesh, [at], PAPER_TARGET), mesh.name
     elif scan:
         pair, source = evaluate.scan_pair(scan, 16 if rows is None else rows, sensor), scan.name
     else:
@@ -101,10 +104,11 @@ def train(
     `torchrun --nproc-per-node N -m ilnet train MODEL` shares each batch among N processes or GPUs.
     """
     from ilnet.learning import train as training
+    from ilnet.sensor import PAPER_TARGET
 
     if size and not data:
         raise click.UsageError("--size goes with --data DIR")
-    figures = training.train(model, preset, out, steps, seed, data, size or training.TARGET_SIZE)
+    figures = training.train(model, preset, out, steps, seed, data, size or PAPER_TARGET.shape)
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
 
 
@@ -140,10 +144,11 @@ def evaluate_(
         raise click.UsageError("--rows and --sensor go with --scan FILE")
     from ilnet import models
     from ilnet.learning import evaluate
+    from ilnet.sensor import PAPER_INPUT, PAPER_TARGET
     from ilnet.world import meshes, towns
 
     loaded = {name: models.load(name) for name in names}
-    output = evaluate.INPUT.resize(*(size or (128, 2048)))
+    output = PAPER_INPUT.resize(*(size or PAPER_TARGET.shape))
     if scan:
         pairs = [evaluate.scan_pair(scan, 16 if rows is None else rows, sensor)]
     elif scene in towns.NAMES:
@@ -160,7 +165,7 @@ def evaluate_(
         if scans and scans > len(positions):
             raise click.UsageError(f"--scans is {scans}, but {at} holds {len(positions)} positions")
         pairs = evaluate.mesh_pairs(mesh, positions[:scans], output)
-    results = evaluate.evaluate(loaded, pairs)
+    results = evaluate.measure(loaded, pairs)
     if as_json:
         click.echo(json.dumps(results[0] if len(results) == 1 else results))
         return
@@ -243,6 +248,7 @@ def simulate(
     part, _, parts = shard.partition("/")
     if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
         raise click.UsageError(f"--shard is {shard!r}; it should be I/N with 1 <= I <= N, such as 2/3")
+    from ilnet.commands import options
     from ilnet.data import generate
     from ilnet.sensor import preset
     from ilnet.world.towns import NAMES
@@ -250,13 +256,10 @@ def simulate(
     if mesh and at:
         places = generate.mesh_place(mesh, at)
     else:
-        places = generate.town_places(towns.split(",") if towns else NAMES)
-    if sensor:
-        sensors = [preset(name) for name in sensor.split(",")]
-    else:
-        sensors = generate.sensors_of_sizes((sizes or _SIZES).split(","))
+        places = generate.town_places(options.towns(towns or ",".join(NAMES)))
+    sensors = [preset(name) for name in sensor.split(",")] if sensor else options.sensors(sizes or _SIZES)
+    wanted = options.effects(effects)
     try:
-        wanted = generate.effects_of(effects)
         archive = generate.generate(out, places, scans, sensors, seed, (int(part), int(parts)), workers, wanted)
     except KeyboardInterrupt:
         click.echo(f"interrupted: what is complete stays in {out}; the same command goes on from there", err=True)
@@ -302,7 +305,7 @@ def survey(
     from ilnet.commands import survey as comparison
     from ilnet.world.towns import NAMES
 
-    entries = comparison.survey(scans, zip(meshes, at, strict=True), NAMES if towns == ("all",) else towns)
+    entries = comparison.compare(scans, zip(meshes, at, strict=True), NAMES if towns == ("all",) else towns)
     found = "[\n" + ",\n".join(map(json.dumps, comparison.records(entries))) + "\n]"
     comparison.draw(entries, out / "survey.png")
     (out / "survey.json").write_text(found + "\n")

@@ -6,26 +6,24 @@ from typing import Any
 from ilnet import models, scan_files
 from ilnet.commands import plot
 from ilnet.learning import metrics
-from ilnet.learning.evaluate import INPUT
-from ilnet.scan import Scan
-from ilnet.sensor import preset
+from ilnet.scan import Pair, Scan
+from ilnet.sensor import PAPER_INPUT, PAPER_TARGET
 from ilnet.world import places, simulate
 
-__all__ = ["METHODS", "OUTPUT", "TOWN", "demo", "from_town"]
+__all__ = ["METHODS", "TOWN", "demo", "from_town"]
 
 METHODS = ("nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-prior")
-OUTPUT = preset("paper-128x2048")
 # No network was trained here, nor any choice made.
 TOWN = "town10"
 _WAYPOINT = 1400
 
 
-def from_town() -> tuple[Scan, Scan]:
+def from_town() -> Pair:
     """A scan of 16×1024 in the embedded town, and what 128×2048 rays measure there."""
-    street = places.street(TOWN, seed=0, device=simulate.best_device())
-    pose = street.pose(_WAYPOINT)
-    world = street.world(pose[:3, 3], seed=0)
-    return simulate.simulate(world, INPUT, pose), simulate.simulate(world, OUTPUT, pose)
+    place = places.town(TOWN, device=simulate.best_device())
+    pose = place.pose(_WAYPOINT)
+    world = place.world(pose[:3, 3], seed=0)
+    return simulate.scan(world, PAPER_INPUT, pose), simulate.scan(world, PAPER_TARGET, pose)
 
 
 def demo(scan: Scan, truth: Scan, out: Path, source: str) -> dict[str, Any]:
@@ -46,10 +44,9 @@ def demo(scan: Scan, truth: Scan, out: Path, source: str) -> dict[str, Any]:
         ranges = models.load(name).to(scan.ranges.device).ranges(scan, truth.sensor)
         figures[name] = metrics.compare(ranges, truth)
         upsampled[name] = models.returns(ranges, scan.sensor, truth.sensor)
-    size = {"input": "x".join(map(str, scan.sensor.shape)), "output": "x".join(map(str, truth.sensor.shape))}
-    pictures = {f"input, {size['input']}": scan, **upsampled, f"truth, {size['output']}": truth}
+    pictures = {f"input, {scan.sensor.size}": scan, **upsampled, f"truth, {truth.sensor.size}": truth}
     plot.range_images(pictures, out / "range_images.png", f"{source}: range images")
     plot.range_images(pictures, out / "range_images_sector.png", f"{source}: 90° of them", sector=90)
     plot.point_clouds({n: s for n, s in pictures.items() if n != "nearest"}, out / "points.png")
     scan_files.write(out / "iln-prior.ply", upsampled["iln-prior"])
-    return {"methods": figures, "input": size["input"], "output": size["output"]}
+    return {"methods": figures, "input": scan.sensor.size, "output": truth.sensor.size}

@@ -21,6 +21,8 @@ from safetensors import safe_open
 from ilnet import data, models, scan_files
 from ilnet.commands import plot
 from ilnet.learning import evaluate, train
+from ilnet.scan import Pair
+from ilnet.sensor import PAPER_INPUT, format_size
 from ilnet.world import towns
 
 __all__ = ["EXPERIMENTS", "Study", "results"]
@@ -76,9 +78,9 @@ class Study:
     measured: tuple[Path, ...] = ()
 
     @cached_property
-    def probe(self) -> list[evaluate.Pair]:
+    def probe(self) -> list[Pair]:
         """Test scans that are measured in the course of a training."""
-        output = evaluate.INPUT.resize(*SIZES[0])
+        output = PAPER_INPUT.resize(*SIZES[0])
         return [pair for town in towns.TEST for pair in evaluate.town_pairs(town, 4, output)]
 
     def trained(self, label: str, name: str, **options: Any) -> Path:
@@ -104,9 +106,9 @@ class Study:
         loaded = {label: f if isinstance(f, models.Model) else models.load(f) for label, f in files.items()}
         rows = []
         for size in sizes or SIZES:
-            output = evaluate.INPUT.resize(*size)
+            output = PAPER_INPUT.resize(*size)
             pairs = [pair for town in towns.TEST for pair in evaluate.town_pairs(town, self.scans, output)]
-            rows += evaluate.evaluate(loaded, pairs)
+            rows += evaluate.measure(loaded, pairs)
         return rows
 
     def _steps_of_lidar_sr(self) -> str:
@@ -144,7 +146,7 @@ def table(study: Study) -> None:
     methods, rows = {}, []
     for size in SIZES:
         lidar_sr = {}
-        if f"{size[0]}x{size[1]}" in stored:
+        if format_size(size) in stored:
             file = study.trained(f"lidar-sr-{size[0]}", "lidar-sr", archive=study.archive, target=size)
             lidar_sr = {"lidar-sr": file}
         methods[size] = rules | lidar_sr | networks
@@ -167,7 +169,7 @@ def table(study: Study) -> None:
 def _draw_points(study: Study, size: tuple[int, int], files: Mapping[str, str | Path]) -> None:
     """The same crop of a test scan by every method, as points."""
     for town in towns.TEST:
-        [(sparse, dense)] = evaluate.town_pairs(town, 1, evaluate.INPUT.resize(*size))
+        [(sparse, dense)] = evaluate.town_pairs(town, 1, PAPER_INPUT.resize(*size))
         shown = {"input": sparse}
         for name, file in files.items():
             shown[name] = models.load(file).to(sparse.ranges.device).upsample(sparse, dense.sensor)
@@ -255,7 +257,7 @@ def attention(study: Study) -> None:
 
 
 def _frame_time(model: models.Model) -> float:
-    [(scan, truth)] = evaluate.town_pairs(towns.TEST[0], 1, evaluate.INPUT.resize(*SIZES[1]))
+    [(scan, truth)] = evaluate.town_pairs(towns.TEST[0], 1, PAPER_INPUT.resize(*SIZES[1]))
     device = scan.ranges.device
     frames = models.Upsampler(model.to(device), scan.sensor, truth.sensor, device=device)
     seconds = []
@@ -334,7 +336,7 @@ def real(study: Study) -> None:
         beams = scan_files.read(path).sensor.shape[0]
         for kept in [count for count in (8, 16, 32) if beams // 16 <= count < beams][-2:]:
             pair = evaluate.scan_pair(path, kept)
-            rows += [{"scan": path.stem, "beams": kept, **row} for row in evaluate.evaluate(loaded, [pair])]
+            rows += [{"scan": path.stem, "beams": kept, **row} for row in evaluate.measure(loaded, [pair])]
     study.write("real", rows)
     figure = Figure(figsize=(10, 3.4), layout="constrained")
     axis = figure.subplots()

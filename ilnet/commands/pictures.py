@@ -83,7 +83,7 @@ def _scan(town: Town, about: tuple[np.ndarray, np.ndarray], at: np.ndarray, head
     vertices = np.concatenate([town.vertices, about[0]])
     triangles = np.concatenate([town.triangles, about[1] + len(town.vertices)])
     mesh = Mesh(vertices, triangles, simulate.best_device())
-    return simulate.simulate(mesh, _SENSOR, simulate.pose(torch.tensor(at), heading))
+    return simulate.scan(mesh, _SENSOR, simulate.pose(torch.tensor(at), heading))
 
 
 def _surface(vertices: np.ndarray, triangles: np.ndarray, paint: np.ndarray):

@@ -22,10 +22,9 @@ from ilnet import scan_files
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
 from ilnet.world import meshes, places, simulate
-from ilnet.world.effects import Effects, simulate_with
-from kernels import Mesh
+from ilnet.world.effects import Effects
 
-__all__ = ["Entry", "Statistics", "draw", "ground_height", "records", "statistics", "survey", "table"]
+__all__ = ["Entry", "Statistics", "compare", "draw", "ground_height", "records", "statistics", "table"]
 
 NOISE = Effects(range_noise=0.01, range_noise_growth=0.0005)
 """Of simulated scans: what ranges along smooth surfaces of measured ones scatter, 1 to 2 cm near and 3 to 6 cm far."""
@@ -43,8 +42,8 @@ _FLAT, _UPRIGHT = 15, 75
 _WINDOW = 0.75
 # In a town; a mesh brings its own.
 _POSITIONS = 10
-# Where no measured scan brings a sensor.
-_SENSOR = "paper-64x1024"
+# Used where no measured scan brings a sensor.
+_SENSOR = preset("paper-64x1024")
 
 
 @dataclass(frozen=True)
@@ -198,59 +197,59 @@ def _surfaces(scan: Scan) -> tuple[torch.Tensor, torch.Tensor]:
     return slope, (rays[2] * ranges)[inner][smooth]
 
 
-def survey(files: Iterable[Path], mesh_files: Iterable[tuple[Path, Path]], town_names: Iterable[str]) -> list[Entry]:
+def compare(files: Iterable[Path], mesh_files: Iterable[tuple[Path, Path]], town_names: Iterable[str]) -> list[Entry]:
     """Returns the statistics of measured scans, and of towns and meshes seen with the rays of each.
 
     Args:
-        files: Scans that name their angles, see `ilnet.scan_files.read`; where there is none, the rays are those of
-            the preset paper-64x1024.
+        files: Scans that hold their angles, see `ilnet.scan_files.read`. Without any, the rays are those of the preset
+            paper-64x1024.
         mesh_files: Mesh files (metres, z up), each with a JSON file of `positions`, a list of x, y, z [m], which are
             `sensor_height_m` above its ground.
-        town_names: Of `ilnet.world.towns.NAMES`. Each is scanned from 10 waypoints in its traffic.
+        town_names: Names from `ilnet.world.towns.NAMES`. Each town is scanned from 10 waypoints in its traffic.
 
     Raises:
         OSError: If a file is missing.
-        ValueError: If a file or a name is not of that kind, or nothing is in range.
+        ValueError: If a file or a name is not of that kind, two scans or two of the rest have one name, or nothing is
+            in range.
     """
+    files, mesh_files, town_names = list(files), list(mesh_files), list(town_names)
+    _refuse_doubles([path.stem for path in files])
+    _refuse_doubles([path.stem for path, _ in mesh_files] + town_names)
     entries = []
     sensors: list[tuple[str, Sensor, float]] = []
     for path in files:
         scan = scan_files.read(path)
         entries.append(Entry(path.stem, path.stem, "measured", [_examined(path, scan)]))
         sensors.append((path.stem, scan.sensor, ground_height(scan) or places.SENSOR_HEIGHT))
-    sensors = sensors or [(_SENSOR, preset(_SENSOR), places.SENSOR_HEIGHT)]
+    sensors = sensors or [(_SENSOR.name, _SENSOR, places.SENSOR_HEIGHT)]
     device = simulate.best_device()
     for name in town_names:
-        entries += _simulated(name, "town", _in_town(places.street(name, device=device)), sensors)
+        town = places.town(name, device=device)
+        entries += _simulated(name, "town", town, town.spread(_POSITIONS), sensors)
     for path, positions in mesh_files:
-        mesh = Mesh(*meshes.read(path), device)
-        poses = [simulate.pose(tuple(at)) for at in meshes.read_positions(positions, places.SENSOR_HEIGHT)]
-        entries += _simulated(path.stem, "mesh", [([mesh], pose) for pose in poses], sensors)
+        mesh = places.mesh(path, meshes.read_positions(positions, places.SENSOR_HEIGHT), device)
+        entries += _simulated(path.stem, "mesh", mesh, range(len(mesh.waypoints)), sensors)
     return sorted(entries, key=lambda entry: [name for name, *_ in sensors].index(entry.sensor))
 
 
-# What stands around a sensor, and its pose `places.SENSOR_HEIGHT` above the ground.
-_Place = tuple[list[Mesh], torch.Tensor]
-
-
-def _in_town(street: places.Street) -> list[_Place]:
-    places = []
-    for number in np.linspace(0, len(street.town.waypoints) - 1, _POSITIONS + 2)[1:-1].astype(int).tolist():
-        pose = street.pose(number)
-        places.append((street.world(pose[:3, 3], number), pose))
-    return places
+def _refuse_doubles(names: Sequence[str]) -> None:
+    """Results go by the names of their sources, so two of one name would become one."""
+    for number, name in enumerate(names):
+        if name in names[:number]:
+            raise ValueError(f"two sources are called {name}; rename a file, or leave one out")
 
 
 def _simulated(
-    source: str, kind: str, found_places: list[_Place], sensors: Iterable[tuple[str, Sensor, float]]
+    source: str, kind: str, place: places.Place, waypoints: Iterable[int], sensors: Iterable[tuple[str, Sensor, float]]
 ) -> list[Entry]:
+    # The same traffic for sensors at all heights.
+    worlds = [(waypoint, place.world(place.position(waypoint), waypoint)) for waypoint in waypoints]
     entries = []
     for name, sensor, height in sensors:
         found = []
-        for number, (world, pose) in enumerate(found_places):
-            lifted = pose.clone()
-            lifted[2, 3] += height - places.SENSOR_HEIGHT
-            scan = simulate_with(NOISE, world, sensor, lifted, torch.Generator().manual_seed(number))
+        for number, (waypoint, world) in enumerate(worlds):
+            pose = place.pose(waypoint, height - places.SENSOR_HEIGHT)
+            scan = simulate.scan(world, sensor, pose, NOISE, seed=number)
             found.append(_examined(f"{source}, position {number}", scan))
         entries.append(Entry(name, source, kind, found))
     return entries
@@ -331,7 +330,7 @@ def draw(entries: Sequence[Entry], path: Path) -> None:
     """Draws the histograms for the rays of each sensor, and the summaries of all sources beside each other.
 
     Args:
-        entries: Of `survey`.
+        entries: Results of `compare`.
         path: A picture file; its suffix says the format.
     """
     from matplotlib.figure import Figure

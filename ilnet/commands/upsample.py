@@ -7,7 +7,6 @@ from pathlib import Path
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from ilnet import models, scan_files
-from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 from ilnet.world import simulate
 
@@ -54,8 +53,7 @@ def upsample(
         try:
             if result in written:
                 raise ValueError(f"{path}: another file of this name became {result} already; rename one")
-            scan = scan_files.read(path, sensor)
-            scan = Scan(scan.ranges.to(device), scan.sensor)
+            scan = scan_files.read(path, sensor).to(device)
             if frames is None or frames.source != scan.sensor:
                 wanted = target if isinstance(target, Sensor) else scan.sensor.resize(*target)
                 frames = models.Upsampler(model, scan.sensor, wanted, device=device)

@@ -95,9 +95,9 @@ class Archive:
 
         Args:
             path: Its folder; made as needed.
-            scans: How many it shall hold.
-            sensors: For each size, such as "64x1024", whose rays are cast.
-            attributes: What else decides its content, `towns` among it: kept as attributes of the group.
+            scans: Number of scans in the finished archive.
+            sensors: The sensor of each size, such as "64x1024".
+            attributes: What else decides the content, among it `towns`; kept as attributes of the group.
 
         Raises:
             OSError: If the folder cannot be written.
@@ -262,17 +262,17 @@ def _refuse_other(path: Path, files: dict[str, bytes]) -> None:
         try:
             there = settings((path / "zarr.json").read_bytes())
         except (ValueError, KeyError) as error:
-            raise ValueError(f"{path}: its zarr.json is damaged or of another kind; give another --out") from error
+            raise ValueError(f"{path}: its zarr.json is damaged or of another kind; give another folder") from error
         here = settings(files["zarr.json"])
         for key in sorted(here.keys() | there.keys()):
             if there.get(key) != here.get(key):
                 raise ValueError(
                     f"{path} holds another archive: its {key} is {there.get(key)}, not {here.get(key)}; "
-                    "give another --out, or what it was made with"
+                    "give another folder, or what this archive was made with"
                 )
     for name, content in files.items():
         if (path / name).exists() and (path / name).read_bytes() != content:
-            raise ValueError(f"{path} holds another archive: its {name} differs; give another --out")
+            raise ValueError(f"{path} holds another archive: its {name} differs; give another folder")
 
 
 def _put(file: Path, content: bytes) -> None:

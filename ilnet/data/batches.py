@@ -5,7 +5,7 @@ The paper trains on the former and calls the latter intractable (Sec. III-A).
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,16 +16,12 @@ from torch.utils.data import IterableDataset, get_worker_info
 from ilnet.data.archive import Archive
 from ilnet.data.rimg import RangeImageTree
 from ilnet.sensor import Sensor, angles_to_directions
-from ilnet.world import simulate, towns
-from ilnet.world.places import SENSOR_HEIGHT, Street
+from ilnet.world import simulate
+from ilnet.world.places import RAYS_JITTER, Place
 from kernels import Mesh
 
 __all__ = ["Batch", "ContinuousRays", "StoredImages"]
 
-# Metres by which the height of the sensor varies from car to car.
-_HEIGHT_JITTER = 0.3
-# Radians: a car pitches and rolls.
-_TILT_JITTER = math.radians(2.0)
 # Columns at a crop's sides that no query falls into: there the network sees a border no full circle has.
 _MARGIN = 8
 
@@ -46,13 +42,13 @@ class Batch(NamedTuple):
 class ContinuousRays(IterableDataset):
     """Endless batches of crops and of rays at random directions between their pixels.
 
-    Each crop has a street, a waypoint, a height, a yaw, a tilt and traffic of its own. A query's direction is uniform
-    in elevation and azimuth: no stored image contains it. Rays are cast when a batch is asked for, where the streets
-    are: on a GPU, or on the CPU, where the workers of a `DataLoader` take turns. The batches are the same for any
+    Each crop has a place, a waypoint, a height, a yaw, a tilt and traffic of its own. A query's direction is uniform in
+    elevation and azimuth: no stored image contains it. Rays are cast when a batch is asked for, on the device of the
+    places: on a GPU, or on the CPU, where the workers of a `DataLoader` take turns. The batches are the same for any
     number of workers.
 
     Args:
-        streets: Where scans are taken; each is drawn equally often.
+        places: Where scans are taken, all on one device; each is drawn equally often.
         sensor: The input sensor.
         crops: Crops B in a batch.
         columns: Columns W of a crop.
@@ -64,7 +60,7 @@ class ContinuousRays(IterableDataset):
 
     def __init__(
         self,
-        streets: list[Street],
+        places: Sequence[Place],
         sensor: Sensor,
         crops: int,
         columns: int,
@@ -73,7 +69,9 @@ class ContinuousRays(IterableDataset):
         start: int = 0,
         part: tuple[int, int] = (0, 1),
     ):
-        self.streets, self.crops, self.queries, self.seed, self.start = streets, crops, queries, seed, start
+        self.places, self.crops, self.queries, self.seed, self.start = places, crops, queries, seed, start
+        meshes = [place.mesh for place in places]  # made here, once, and not by every worker
+        self.device = meshes[0].device
         self.sensor = replace(sensor, azimuths=sensor.azimuths[:columns], name=f"{sensor.name} crop")
         self.part = _part(crops, part)
 
@@ -91,48 +89,47 @@ class ContinuousRays(IterableDataset):
         azimuth = uniform(*sensor.azimuths[[_MARGIN, -1 - _MARGIN]], crops, self.queries)[self.part]
         grid = sensor.directions().double().view(1, -1, 3).expand(len(azimuth), -1, -1)
         rays = torch.cat((grid, angles_to_directions(elevation, azimuth)), 1)
-        town = torch.randint(len(self.streets), (crops,), generator=generator)
-        along = uniform(0, 1, crops)
-        at = torch.stack([self._waypoint(*place) for place in zip(town.tolist(), along.tolist(), strict=True)])
-        at[:, 2] += SENSOR_HEIGHT + uniform(-_HEIGHT_JITTER, _HEIGHT_JITTER, crops)
-        turn, tilt = uniform(-math.pi, math.pi, crops), uniform(-_TILT_JITTER, _TILT_JITTER, 2, crops)
-        town, pose = town[self.part], simulate.pose(at, turn, *tilt)[self.part]
-        ranges = self._cast_traffic(town, pose, rays, number)
-        for which in town.unique().tolist():
-            chosen = town == which
-            standing = simulate.cast(self.streets[which].mesh, pose[chosen], rays[chosen], sensor.max_range)
+        where = torch.randint(len(self.places), (crops,), generator=generator)
+        along, lift = uniform(0, 1, crops), uniform(-RAYS_JITTER.height, RAYS_JITTER.height, crops)
+        turn, tilt = uniform(-math.pi, math.pi, crops), uniform(-RAYS_JITTER.tilt, RAYS_JITTER.tilt, 2, crops)
+        stands = zip(where.tolist(), along.tolist(), lift.tolist(), strict=True)
+        at = torch.stack([self._position(*stand) for stand in stands])
+        where, pose = where[self.part], simulate.pose(at, turn, *tilt)[self.part]
+        ranges = self._cast_traffic(where, pose, rays, number)
+        for which in where.unique().tolist():
+            chosen = where == which
+            standing = simulate.cast(self.places[which].mesh, pose[chosen], rays[chosen], sensor.max_range)
             ranges[chosen] = simulate.nearest([standing, ranges[chosen]])
         ranges = ranges.where(ranges >= max(sensor.min_range, 1e-9), sensor.norm_range).cpu()
         image, ranges = ranges.split([grid.shape[1], self.queries], 1)
         return Batch(image.unflatten(1, sensor.shape), sensor.locate(elevation, azimuth), ranges.contiguous(), False)
 
-    def _waypoint(self, town: int, along: float) -> torch.Tensor:
-        waypoints = self.streets[town].town.waypoints
-        return torch.from_numpy(waypoints[int(along * len(waypoints))]).double()
+    def _position(self, where: int, along: float, lift: float) -> torch.Tensor:
+        place = self.places[where]
+        return place.position(int(along * len(place.waypoints)), lift)
 
-    def _cast_traffic(self, town: torch.Tensor, pose: torch.Tensor, rays: torch.Tensor, number: int) -> torch.Tensor:
-        """Ranges (B, N) to the vehicles and people of each crop; 0 where none is met.
+    def _cast_traffic(self, where: torch.Tensor, pose: torch.Tensor, rays: torch.Tensor, number: int) -> torch.Tensor:
+        """Returns the ranges (B, N) to the vehicles and people of each crop; 0 where none is met.
 
         They are one mesh, in which the crops stand so far apart that none sees another's.
         """
-        apart = torch.zeros(len(town), 3, dtype=torch.float64)
-        apart[:, 0] = torch.arange(len(town)) * 4 * self.sensor.max_range
+        apart = torch.zeros(len(where), 3, dtype=torch.float64)
+        apart[:, 0] = torch.arange(len(where)) * 4 * self.sensor.max_range
         first, last = self.sensor.azimuths[[0, -1]]
         middle = angles_to_directions(torch.tensor(0.0), torch.tensor((first + last) / 2)).double()
-        half = abs(last - first) / 2 + _TILT_JITTER
+        half = abs(last - first) / 2 + RAYS_JITTER.tilt
         corners = [torch.empty(0, 3)]
-        for crop, which in enumerate(town.tolist()):
-            position, ahead = pose[crop, :3, 3].numpy(), pose[crop, :3, :3] @ middle
+        for crop, which in enumerate(where.tolist()):
+            position, ahead = pose[crop, :3, 3], pose[crop, :3, :3] @ middle
             sector = math.atan2(ahead[1], ahead[0]), half
             seed = self.seed, number, self.part.start + crop
-            vertices, triangles = towns.traffic(self.streets[which].town, position, seed, sector=sector)
-            moved = (vertices - position + apart[crop].numpy()).astype(np.float32)
+            vertices, triangles = self.places[which].traffic(position, seed, sector)
+            moved = (vertices - position.numpy() + apart[crop].numpy()).astype(np.float32)
             corners.append(torch.from_numpy(moved[triangles.ravel()]))
         joined = torch.cat(corners)
-        device = self.streets[0].mesh.device
         if len(joined) == 0:
-            return torch.zeros(rays.shape[:2], device=device)
-        mesh = Mesh(joined, torch.arange(len(joined)).view(-1, 3), device)
+            return torch.zeros(rays.shape[:2], device=self.device)
+        mesh = Mesh(joined, torch.arange(len(joined)).view(-1, 3), self.device)
         pose = pose.clone()
         pose[:, :3, 3] = apart
         return simulate.cast(mesh, pose, rays, self.sensor.max_range)

@@ -1,7 +1,7 @@
 """Scans simulated in bulk, by several processes or hosts, into an archive on disk.
 
-What scan k of an archive is depends on the archive's seed, its towns, its number of scans and k, and on nothing else:
-so the work may be shared out and interrupted in any way.
+Scan k of an archive depends on the archive's seed, its places, its number of scans and k, and on nothing else. So the
+work can be shared out and interrupted in any way.
 """
 
 import bisect
@@ -12,12 +12,13 @@ import math
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -28,122 +29,85 @@ import torch
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from ilnet.data.archive import UNIT, Archive
-from ilnet.sensor import PRESETS, Sensor, preset
-from ilnet.world import meshes, simulate, towns
+from ilnet.sensor import Sensor
+from ilnet.world import meshes, places, simulate, towns
 from ilnet.world.effects import Effects
-from ilnet.world.places import SENSOR_HEIGHT, Street
+from ilnet.world.places import ARCHIVE_JITTER, Place
 from kernels import Mesh
 
-__all__ = ["Place", "effects_of", "generate", "mesh_place", "sensors_of_sizes", "town_places"]
+__all__ = ["Recipe", "generate", "mesh_place", "town_places"]
 
 T = TypeVar("T")
 
-# Metres and radians that poses vary by, besides their yaw, which is free.
-_HEIGHT_JITTER = 0.1
-_TILT_JITTER = math.radians(1.0)
-# Those that show in ranges.
-_EFFECTS = tuple(field.name for field in fields(Effects) if field.name != "intensity")
-# Metres below the sensor that the ground must lie within.
+# The ground must lie at most this many metres below the sensor.
 _GROUND_WITHIN = 20.0
 
 
-class Place(NamedTuple):
-    """Where scans can be taken."""
+class Recipe(NamedTuple):
+    """A place that is built once a run needs it."""
 
-    vertices: np.ndarray
-    """(V, 3) floating-point, metres."""
-    triangles: np.ndarray
-    """(F, 3) integer."""
-    waypoints: np.ndarray
-    """(N, 3) metres, on the ground."""
-    town: towns.Town | None = None
-    """Whose traffic is drawn; None where there is none."""
+    waypoints: int
+    """How many waypoints it has; scans are shared out by this number."""
+    build: Callable[[], Place]
+    """Builds it; several recipes run in processes of their own."""
 
 
-# For each how many waypoints it has, about, and how to build it.
-Places = dict[str, tuple[int, Callable[[], Place]]]
+def town_places(wanted: Iterable[tuple[str, int]]) -> dict[str, Recipe]:
+    """Returns recipes of towns.
+
+    Args:
+        wanted: For each its name, one of `towns.NAMES`, and its seed.
+
+    Returns:
+        The recipes, by the name, or as "town01:7" where the seed is not 0.
+
+    Raises:
+        ValueError: If a name is unknown, or a town is wanted twice.
+    """
+    device = simulate.best_device()
+    found: dict[str, Recipe] = {}
+    for name, seed in wanted:
+        if name not in towns.NAMES:
+            raise ValueError(f"name is {name!r}; it should be one of {', '.join(towns.NAMES)}")
+        label = f"{name}:{seed}" if seed else name
+        if label in found:
+            raise ValueError(f"wanted has {label} twice; each town should be there once")
+        found[label] = Recipe(towns.WAYPOINTS[name], partial(places.town, name, seed, device))
+    return found
 
 
-def town_places(names: Iterable[str]) -> Places:
-    """Returns how to build towns: each name is one of `towns.NAMES`, with `:SEED` behind it unless that is 0."""
-    places: Places = {}
-    for label in names:
-        name, _, seed = label.partition(":")
-        if name not in towns.NAMES or not (seed or "0").isdecimal():
-            raise ValueError(
-                f"--towns names {label!r}; it should be one of {', '.join(towns.NAMES)}, or such as "
-                f"{towns.NAMES[0]}:7, the same town with another seed"
-            )
-        if label in places:
-            raise ValueError(f"--towns names {label} twice")
-        places[label] = towns.WAYPOINTS[name], partial(_build_town, name, int(seed or 0))
-    return places
-
-
-def _build_town(name: str, seed: int) -> Place:
-    town = towns.build(name, seed)
-    return Place(town.vertices, town.triangles, town.waypoints, town)
-
-
-def mesh_place(file: Path, positions: Path) -> Places:
+def mesh_place(file: Path, positions: Path) -> dict[str, Recipe]:
     """Reads a mesh to scan.
 
     Args:
-        file: What PyVista reads, metres, z up.
-        positions: JSON, whose `positions` are a list of [x, y, z], metres in the mesh, of the sensor.
+        file: A file that `meshes.read` reads, metres, z up.
+        positions: JSON file of the sensor's positions in the mesh, see `meshes.read_positions`.
+
+    Returns:
+        Its recipe, by the name of the file and a digest of both files.
 
     Raises:
         OSError: If a file cannot be read.
-        ValueError: If one is damaged, or there is no ground under a position.
+        ValueError: If a file is damaged, or there is no ground under a position.
     """
-    at = torch.from_numpy(meshes.read_positions(positions))
-    vertices, triangles = meshes.read(file)
+    at = meshes.read_positions(positions)
+    place = places.mesh(file, at, simulate.best_device())
     down = torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64)
-    ground = Mesh(vertices, triangles).cast(at, down, _GROUND_WITHIN).range
+    ground = Mesh(place.vertices, place.triangles).cast(torch.from_numpy(at), down, _GROUND_WITHIN).range
     for number in (ground == 0).nonzero()[:1, 0].tolist():
         x, y, z = at[number].tolist()
         raise ValueError(
             f"{file}: no triangle under position {number} ({x:g}, {y:g}, {z:g}) within {_GROUND_WITHIN:g} m; "
             "move it or leave it out"
         )
-    place = Place(vertices, triangles, at.numpy() - [0, 0, SENSOR_HEIGHT])
-    # Another mesh or other positions under the same name are another archive.
+    # Another mesh or other positions under the same name make another archive.
     digest = hashlib.sha256(file.read_bytes() + positions.read_bytes()).hexdigest()
-    return {f"{file.name}@{digest[:16]}": (len(at), lambda: place)}
-
-
-def sensors_of_sizes(sizes: Iterable[str]) -> list[Sensor]:
-    """Returns the paper's sensor for each size, such as "64x1024": even beams over ±15°, 2 to 80 m."""
-    sensors = []
-    for size in sizes:
-        rows, _, columns = size.partition("x")
-        if not (rows.isdecimal() and columns.isdecimal()):
-            raise ValueError(f"--sizes has {size!r}; it should be rows x columns, such as 64x1024")
-        name = f"paper-{size}"
-        known = name in PRESETS
-        sensors.append(preset(name) if known else preset("paper-16x1024").resize(int(rows), int(columns)))
-    return sensors
-
-
-def effects_of(settings: Iterable[str]) -> Effects | None:
-    """Returns the effects that settings such as "range_noise=0.02" or "velocity=10,0,0" name; None where there is none.
-
-    Raises:
-        ValueError: If a setting is of another kind.
-    """
-    values: dict[str, Any] = {}
-    for setting in settings:
-        name, _, value = setting.partition("=")
-        default = getattr(Effects(), name, None)
-        if name not in _EFFECTS:
-            raise ValueError(f"--effect is {setting!r}; it should be NAME=VALUE, with a name of: {', '.join(_EFFECTS)}")
-        values[name] = value.split(",") if isinstance(default, tuple) else value
-    return Effects(**values) if values else None
+    return {f"{file.name}@{digest[:16]}": Recipe(len(at), lambda: place)}
 
 
 def generate(
     out: Path,
-    places: Places,
+    recipes: Mapping[str, Recipe],
     scans: int,
     sensors: Iterable[Sensor],
     seed: int = 0,
@@ -155,16 +119,17 @@ def generate(
 
     Args:
         out: The archive's folder.
-        places: Where scans are taken, each waypoint equally often; see `town_places` and `mesh_place`.
-        scans: Their number, of all parts.
-        sensors: Each takes every scan, of the same world and from the same pose.
-        seed: Of waypoints, poses and traffic.
+        recipes: The places where scans are taken, each waypoint equally often; see `town_places` and `mesh_place`.
+        scans: Number of scans, of all parts together.
+        sensors: The sensors that take every scan, in the same world and from the same pose.
+        seed: Seed of waypoints, poses and traffic.
         shard: (i, n): this run does part i of n, counted from 1.
-        workers: Processes on a CPU; as many as torch has threads unless told. On CUDA this one does all.
-        effects: What real sensors do to their measurements.
+        workers: Number of processes on a CPU; by default as many as torch has threads. On CUDA this process simulates
+            all scans. Where the system cannot fork, as on Windows, this process does all the work.
+        effects: What real sensors do to their measurements; None for perfect ranges.
 
     Returns:
-        The archive, complete but for what belongs to other parts.
+        The archive, complete except for what belongs to other parts.
 
     Raises:
         OSError: If the folder cannot be written, or a worker died.
@@ -172,31 +137,33 @@ def generate(
     """
     sizes: dict[str, Sensor] = {}
     for sensor in sensors:
-        size = "{}x{}".format(*sensor.shape)
-        if size in sizes:
-            raise ValueError(f"two sensors have {size} rays; give each an archive of its own")
-        sizes[size] = sensor
+        if sensor.size in sizes:
+            raise ValueError(f"two sensors have {sensor.size} rays; give each an archive of its own")
+        sizes[sensor.size] = sensor
     workers = workers or torch.get_num_threads()
+    if workers > 1 and "fork" not in multiprocessing.get_all_start_methods():
+        tqdm.write(f"this system cannot fork: one process does the work of {workers} workers", file=sys.stderr)
+        workers = 1
     device = simulate.best_device()
-    attributes = {"towns": list(places), "seed": seed, "device": device.type, "version": version("ilnet")}
+    attributes = {"towns": list(recipes), "seed": seed, "device": device.type, "version": version("ilnet")}
     if effects:
         attributes["effects"] = asdict(effects)
     archive = Archive.create(out, scans, sizes, attributes)
     part, parts = shard
     units = {unit for unit in range(-(-scans // UNIT)) if unit % parts == part - 1}
     missing = [unit for unit in archive.missing() if unit in units]
-    plan = _Plan(archive, seed, [count for count, _ in places.values()], effects)
+    plan = _Plan(archive, seed, [recipe.waypoints for recipe in recipes.values()], effects)
     rays = sum(math.prod(sensor.shape) for sensor in sizes.values())
     total = sum(len(plan.scans(unit)) for unit in units)
     todo = sum(len(plan.scans(unit)) for unit in missing)
-    needed = sorted({plan.town(k) for unit in missing for k in plan.scans(unit)})
-    builders = [build for _, build in places.values()]
+    needed = sorted({plan.number(k) for unit in missing for k in plan.scans(unit)})
+    builders = [recipe.build for recipe in recipes.values()]
     with (
         tqdm(total=len(needed), desc="towns", unit=" towns", leave=False, disable=not needed) as progress,
         contextlib.closing(_parallel(lambda number: (number, builders[number]()), needed, workers)) as built,
     ):
         for number, place in built:
-            plan.add(number, place, Mesh(place.vertices, place.triangles, device))
+            plan.add(number, place)
             progress.update()
     with tqdm(total=total, initial=total - todo, desc=str(out), unit=" scans") as progress:
         start, done = time.perf_counter(), 0
@@ -211,49 +178,46 @@ def generate(
 
 
 class _Plan:
-    """What each scan of an archive is, once its town was added."""
+    """What each scan of an archive is, once its place was added."""
 
     def __init__(self, archive: Archive, seed: int, waypoints: list[int], effects: Effects | None):
         self.archive, self.seed, self.effects = archive, seed, effects
         before = itertools.accumulate(waypoints, initial=0)
         self._first = [len(archive) * number // sum(waypoints) for number in before][:-1]
         self._places: dict[int, Place] = {}
-        self._meshes: dict[int, Mesh] = {}
 
-    def add(self, number: int, place: Place, mesh: Mesh) -> None:
-        """Takes in the town of that number."""
-        self._places[number], self._meshes[number] = place, mesh
+    def add(self, number: int, place: Place) -> None:
+        """Takes in the place of that number."""
+        self._places[number] = place
         # Compiles the kernels and sorts the triangles, once for all workers.
         self.images(self._first[number])
 
     def scans(self, unit: int) -> range:
-        """Which scans a unit holds."""
+        """Returns the numbers of the scans in a unit."""
         return range(unit * UNIT, min((unit + 1) * UNIT, len(self.archive)))
 
-    def town(self, scan: int) -> int:
-        """The number of a scan's town: those of one town follow each other, so that a unit needs few."""
+    def number(self, scan: int) -> int:
+        """Returns the number of a scan's place; the scans of one place are neighbours, so a unit needs few places."""
         return bisect.bisect_right(self._first, scan) - 1
 
     def waypoint(self, scan: int) -> int:
-        """The number of a scan's waypoint: drawn without repetition until there are no more, then again."""
-        town = self.town(scan)
-        turn, index = divmod(scan - self._first[town], count := len(self._places[town].waypoints))
-        return int(np.random.default_rng([self.seed, town, turn, 2]).permutation(count)[index])
+        """Returns the number of a scan's waypoint: drawn without repetition until there are no more, then again."""
+        number = self.number(scan)
+        turn, index = divmod(scan - self._first[number], count := len(self._places[number].waypoints))
+        return int(np.random.default_rng([self.seed, number, turn, 2]).permutation(count)[index])
 
     def pose(self, scan: int) -> torch.Tensor:
-        """The sensor's pose (4, 4)."""
-        rng = np.random.default_rng([self.seed, scan, 1])
-        at = torch.tensor(self._places[self.town(scan)].waypoints[self.waypoint(scan)], dtype=torch.float64)
-        at[2] += SENSOR_HEIGHT + rng.uniform(-_HEIGHT_JITTER, _HEIGHT_JITTER)
-        return simulate.pose(at, rng.uniform(-math.pi, math.pi), *rng.uniform(-_TILT_JITTER, _TILT_JITTER, 2))
+        """Returns the sensor's pose (4, 4)."""
+        rng, (height, tilt) = np.random.default_rng([self.seed, scan, 1]), ARCHIVE_JITTER
+        at = self._places[self.number(scan)].position(self.waypoint(scan), rng.uniform(-height, height))
+        return simulate.pose(at, rng.uniform(-math.pi, math.pi), *rng.uniform(-tilt, tilt, 2))
 
     def images(self, scan: int) -> dict[str, np.ndarray]:
-        """What each sensor measures, (H, W) uint16, as the archive stores it."""
-        sensors = self.archive.sensors
-        mesh, town, pose = self._meshes[self.town(scan)], self._places[self.town(scan)].town, self.pose(scan)
-        world = Street(town, mesh).world(pose[:3, 3], [self.seed, scan]) if town else [mesh]
+        """Returns what each sensor measures, (H, W) uint16, as the archive stores it."""
+        sensors, pose = self.archive.sensors, self.pose(scan)
+        world = self._places[self.number(scan)].world(pose[:3, 3], [self.seed, scan])
         chance = int(np.random.default_rng([self.seed, scan, 3]).integers(2**63))
-        found = {size: simulate.simulate(world, sensor, pose, self.effects, chance) for size, sensor in sensors.items()}
+        found = {size: simulate.scan(world, sensor, pose, self.effects, chance) for size, sensor in sensors.items()}
         return {size: self.archive.quantise(size, measured.ranges) for size, measured in found.items()}
 
     def do(self, unit: int) -> int:
@@ -263,7 +227,7 @@ class _Plan:
         self.archive.write(
             unit,
             {size: np.stack([each[size] for each in images]) for size in self.archive.sizes},
-            np.array([self.town(scan) for scan in scans]),
+            np.array([self.number(scan) for scan in scans]),
             np.array([self.waypoint(scan) for scan in scans]),
             np.stack([self.pose(scan).numpy() for scan in scans]),
         )
@@ -271,7 +235,7 @@ class _Plan:
 
 
 def _parallel(function: Callable[[int], T], numbers: list[int], workers: int) -> Generator[T]:
-    """Yields what a function returns for each number, as soon as it does, from processes that share all memory."""
+    """Yields what a function returns for each number, as soon as it does, from forked processes."""
     if workers == 1 or len(numbers) < 2:
         yield from map(function, numbers)
         return
@@ -283,16 +247,16 @@ def _parallel(function: Callable[[int], T], numbers: list[int], workers: int) ->
     except BrokenProcessPool:
         raise ChildProcessError(
             "a worker died, perhaps for lack of memory; what is complete is kept: run the same again, with fewer "
-            "--workers"
+            "workers"
         ) from None
     finally:
-        # Workers that are still at something end at once: a file that is not whole is no file.
+        # Busy workers end at once; a file that they have not finished does not count.
         os.close(pipe[1])
         pool.shutdown(cancel_futures=True)
         os.close(pipe[0])
 
 
-# What a worker inherited; it cannot be sent.
+# Inherited by a worker, since it cannot be sent.
 _function: Callable[[int], Any]
 
 
@@ -300,14 +264,14 @@ def _begin(function: Callable[[int], Any], reading: int, writing: int) -> None:
     global _function
     _function = function
     torch.set_num_threads(1)
-    # Ctrl-C reaches all: workers end without a word, and the parent says it.
+    # Ctrl-C reaches every process: workers end in silence, and the parent says what happened.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     os.close(writing)
     threading.Thread(target=_end_with, args=(reading,), daemon=True).start()
 
 
 def _end_with(reading: int) -> None:
-    # Comes back when no process holds the other end of the pipe: the parent closed it, or was killed.
+    # Returns when no process holds the other end of the pipe: the parent closed it, or was killed.
     os.read(reading, 1)
     os._exit(1)
 

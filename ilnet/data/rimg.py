@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from ilnet.scan import Scan
-from ilnet.sensor import Sensor
+from ilnet.sensor import Sensor, format_size
 
 __all__ = ["RangeImageTree"]
 
@@ -58,7 +58,7 @@ class RangeImageTree:
         self.towns = tuple(sorted(towns.values()))
         self._scans = sorted({(towns[file.parent.parent], int(file.stem), file.parent.parent) for file in found})
         shapes = {tuple(map(int, file.parent.name.split("_"))) for file in found}
-        self.sensors = {f"{h}x{w}": self._specified(h, w) for h, w in sorted(shapes)}
+        self.sensors = {format_size((h, w)): self._specified(h, w) for h, w in sorted(shapes)}
         self.sizes = tuple(self.sensors)
 
     @cached_property
@@ -86,7 +86,7 @@ class RangeImageTree:
             return Sensor(elevations, azimuths, of["min_r"], of["max_r"], of["norm_r"])
         except ValueError as error:
             raise ValueError(
-                f"{self.path}: its {_SPECIFICATION} makes no sensor of {rows}x{columns}: {error}"
+                f"{self.path}: its {_SPECIFICATION} makes no sensor of {format_size((rows, columns))}: {error}"
             ) from None
 
     def __len__(self) -> int:
@@ -111,12 +111,10 @@ class RangeImageTree:
         content = file.read_bytes()
         whole = _HEADER + 2 * rows * columns
         if len(content) != whole:
-            raise ValueError(
-                f"{file}: holds {len(content)} bytes, {rows}x{columns} ranges take {whole}; download it again"
-            )
+            raise ValueError(f"{file}: holds {len(content)} bytes, {size} ranges take {whole}; download it again")
         header = np.frombuffer(content, "<u8", 2).tolist()
         if header != [rows, columns]:
-            raise ValueError(f"{file}: its header says {header[0]}x{header[1]}, its folder {rows}x{columns}")
+            raise ValueError(f"{file}: its header says {format_size(header)}, its folder {size}")
         ranges = np.frombuffer(content, "<f2", offset=_HEADER).reshape(columns, rows).T.astype(np.float32)
         try:
             return Scan(torch.from_numpy(np.where(ranges > sensor.max_range, 0, ranges)), sensor)

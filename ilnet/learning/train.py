@@ -23,18 +23,14 @@ from torch.utils.data import DataLoader
 
 from ilnet import data, models
 from ilnet.learning import metrics
-from ilnet.scan import Scan
-from ilnet.sensor import preset
+from ilnet.scan import Pair
+from ilnet.sensor import PAPER_INPUT, PAPER_TARGET, format_size, preset
 from ilnet.world import places, simulate, towns
 
 __all__ = ["PRESETS", "Preset", "Training", "train"]
 
-Pair = tuple[Scan, Scan]
-
-INPUT = "paper-16x1024"
-OUTPUT = "paper-64x1024"
-# Of the stored images that pixels are taken from, unless told.
-TARGET_SIZE = 128, 2048
+# What the best weights predict best.
+VALIDATION = preset("paper-64x1024")
 # What the best weights are chosen by: scans of towns that no training sees. (Seed 0, the default, is that of training.)
 HELD_OUT = {"town01": 1, "town03": 1, "town05": 1}
 HELD_OUT_SCANS = 4
@@ -176,7 +172,7 @@ def train(
     steps: int | None = None,
     seed: int = 0,
     archive: Path | None = None,
-    target: tuple[int, int] = TARGET_SIZE,
+    target: tuple[int, int] = PAPER_TARGET.shape,
     probe: Sequence[Pair] = (),
     **arguments: Any,
 ) -> dict[str, float]:
@@ -211,21 +207,23 @@ def train(
     if name not in models.TRAINABLE:
         raise ValueError(f"model {name!r} cannot be trained; these can: {', '.join(models.TRAINABLE)}")
     size = PRESETS[preset_name]
-    source = preset(INPUT).shape
+    source = PAPER_INPUT.shape
     if archive is None and (size.epochs or name == "lidar-sr"):
         raise ValueError(
             f"{name} with preset {preset_name} learns from stored images: make some with `python -m ilnet simulate "
-            f"--sizes {_words(source)},{_words(target)} --out DIR`, and name them with --data DIR"
+            f"--sizes {format_size(source)},{format_size(target)} --out DIR`, and name them with --data DIR"
         )
     if name == "lidar-sr":
         if target[0] % source[0] or target[1] % source[1]:
-            raise ValueError(f"size is {_words(target)}; for lidar-sr it should be a multiple of {_words(source)}")
+            raise ValueError(
+                f"size is {format_size(target)}; for lidar-sr it should be a multiple of {format_size(source)}"
+            )
         arguments = {"rows": target[0] // source[0], "columns": target[1] // source[1], **arguments}
     stored = None if archive is None else data.open_archive(archive)
     per_epoch = -(-len(stored) // size.crops) if stored else 0
     steps = steps or size.steps or size.epochs * per_epoch
     arguments = {**size.arguments(name), **arguments}
-    learns_from = f"{_words(target)} of {archive}" if archive else "continuous rays"
+    learns_from = f"{format_size(target)} of {archive}" if archive else "continuous rays"
     run = {"preset": preset_name, "steps": steps, "seed": seed, "data": learns_from, **arguments}
     folder = out / name
     start = _steps_done(folder / "last.ckpt", run)
@@ -235,12 +233,12 @@ def train(
     lightning.seed_everything(seed, verbose=False)
     model = models.create(name, **arguments)
     samples = _samples(name, size, stored, target, seed, start, (number, processes), device)
-    output = preset(INPUT).resize(*target) if name == "lidar-sr" else preset(OUTPUT)
+    output = PAPER_INPUT.resize(*target) if name == "lidar-sr" else VALIDATION
     held_out: list[Pair] = [
         (pair[0], pair[1])
         for town, held_out_seed in HELD_OUT.items()
         for pair in places.held_out_scans(
-            places.street(town, held_out_seed, device), HELD_OUT_SCANS, [preset(INPUT), output]
+            places.town(town, held_out_seed, device), HELD_OUT_SCANS, [PAPER_INPUT, output]
         )
     ]
     training = Training(model, held_out, size.rate, [epoch * per_epoch for epoch in size.halve_after], run, probe)
@@ -310,9 +308,9 @@ def _samples(
     device: torch.device,
 ) -> data.ContinuousRays | data.StoredImages:
     if stored is None:
-        streets = [places.street(town, 0, device) for town in size.towns]
-        return data.ContinuousRays(streets, preset(INPUT), size.crops, size.columns, size.queries, seed, start, part)
-    source = preset(INPUT).shape
+        streets = [places.town(town, 0, device) for town in size.towns]
+        return data.ContinuousRays(streets, PAPER_INPUT, size.crops, size.columns, size.queries, seed, start, part)
+    source = PAPER_INPUT.shape
     if name == "lidar-sr":
         # It learns from all that it predicts: of as many scans, since its batch norm fails with one, but half as wide.
         scans, sector = size.crops, source[1] if size.epochs else size.columns // 2
@@ -320,11 +318,9 @@ def _samples(
     else:  # as many columns and as many queries as the crops have, in whole scans
         scans, sector = max(1, size.crops * size.columns // source[1]), None
         queries = size.crops * size.queries // scans
-    return data.StoredImages(stored, _words(source), _words(target), scans, queries, seed, start, part, sector)
-
-
-def _words(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
+    return data.StoredImages(
+        stored, format_size(source), format_size(target), scans, queries, seed, start, part, sector
+    )
 
 
 def _workers(device: torch.device) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from ilnet.scan import Scan
 from ilnet.sensor import Sensor, angles_to_directions
 from kernels import Mesh
 
-__all__ = ["RANGE_RESOLUTION", "REFERENCE_RANGE", "Effects", "simulate_with"]
+__all__ = ["RANGE_RESOLUTION", "REFERENCE_RANGE", "Effects", "nearer", "simulate_with"]
 
 RANGE_RESOLUTION = 0.5
 """Metres between hits that are told apart: half the length of a pulse of 3.3 ns."""
@@ -204,6 +204,11 @@ def _footprint(divergence: float, device: torch.device) -> torch.Tensor:
     return torch.cat(rings)
 
 
+def nearer(ranges: torch.Tensor, than: torch.Tensor) -> torch.Tensor:
+    """Returns where some ranges [m] are nearer than others of the same rays; 0 is no return, farther than any."""
+    return (ranges > 0) & ((than == 0) | (ranges < than))
+
+
 def _nearest(
     meshes: Sequence[Mesh], origins: torch.Tensor, directions: torch.Tensor, max_range: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -211,8 +216,8 @@ def _nearest(
     ranges, _, cosines = meshes[0].cast(origins, directions, max_range)
     for mesh in meshes[1:]:
         other = mesh.cast(origins, directions, max_range)
-        nearer = (other.range > 0) & ((ranges == 0) | (other.range < ranges))
-        ranges, cosines = other.range.where(nearer, ranges), other.cosine.where(nearer, cosines)
+        front = nearer(other.range, ranges)
+        ranges, cosines = other.range.where(front, ranges), other.cosine.where(front, cosines)
     return ranges, cosines
 
 

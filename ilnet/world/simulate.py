@@ -1,4 +1,4 @@
-"""A sensor, a pose and meshes make a scan."""
+"""A sensor, a pose and a world of meshes make a scan."""
 
 import math
 from collections.abc import Sequence
@@ -7,10 +7,10 @@ import torch
 
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
-from ilnet.world.effects import Effects, simulate_with
+from ilnet.world.effects import Effects, nearer, simulate_with
 from kernels import Mesh
 
-__all__ = ["Effects", "World", "best_device", "cast", "nearest", "pose", "ranges", "simulate"]
+__all__ = ["World", "best_device", "cast", "nearest", "pose", "ranges", "scan"]
 
 Angle = float | torch.Tensor
 # One mesh or several: a town, and the traffic in it.
@@ -20,7 +20,7 @@ _RAYS_AT_ONCE = 1 << 22
 
 
 def best_device() -> torch.device:
-    """CUDA where there is a device, else the CPU: those that the kernels run on."""
+    """Returns the device that rays are cast on by default: CUDA where there is a GPU, else the CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
@@ -30,24 +30,26 @@ def pose(
     """Builds the transform from the sensor frame to the world.
 
     Args:
-        position: (..., 3) metres, of the sensor in the world.
-        yaw: (...) rad, counter-clockwise about z, applied last.
-        pitch: (...) rad about y; positive lowers the nose.
-        roll: (...) rad about x, applied first.
+        position: (..., 3) of the sensor in the world [m].
+        yaw: (...) [rad], counter-clockwise about z, applied last.
+        pitch: (...) [rad], about y; a positive one lowers the nose.
+        roll: (...) [rad], about x, applied first.
 
     Returns:
-        (..., 4, 4) float64.
+        (..., 4, 4) float64, on the device of the position.
     """
     position = torch.as_tensor(position, dtype=torch.float64)
-    angles = (torch.as_tensor(a, dtype=torch.float64) for a in (yaw, pitch, roll))
+    angles = (torch.as_tensor(a, dtype=torch.float64, device=position.device) for a in (yaw, pitch, roll))
     (cy, sy), (cp, sp), (cr, sr) = ((a.cos(), a.sin()) for a in angles)
-    rows = [
+    rows: list[list[Angle]] = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, position[..., 0]],
         [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, position[..., 1]],
         [-sp, cp * sr, cp * cr, position[..., 2]],
-        [torch.zeros(()), torch.zeros(()), torch.zeros(()), torch.ones(())],
+        [0.0, 0.0, 0.0, 1.0],
     ]
-    entries = torch.broadcast_tensors(*(torch.as_tensor(e, dtype=torch.float64) for row in rows for e in row))
+    entries = torch.broadcast_tensors(
+        *(torch.as_tensor(e, dtype=torch.float64, device=position.device) for row in rows for e in row)
+    )
     return torch.stack(entries, -1).unflatten(-1, (4, 4))
 
 
@@ -55,13 +57,13 @@ def cast(mesh: Mesh, pose: torch.Tensor, directions: torch.Tensor, max_range: fl
     """Casts rays along any directions.
 
     Args:
-        mesh: Metres.
+        mesh: What they may meet, in metres.
         pose: (..., 4, 4) transforms from the sensor frame to that of the mesh.
         directions: (..., N, 3) unit vectors in the sensor frame.
-        max_range: Metres.
+        max_range: How far they reach [m].
 
     Returns:
-        (..., N) float32 metres on the mesh's device; 0 where nothing is met.
+        (..., N) float32 ranges [m] on the mesh's device; 0 where nothing is met.
     """
     pose = pose.to(mesh.device)
     turned = directions.to(mesh.device).double() @ pose[..., :3, :3].mT
@@ -69,30 +71,31 @@ def cast(mesh: Mesh, pose: torch.Tensor, directions: torch.Tensor, max_range: fl
 
 
 def nearest(found: Sequence[torch.Tensor]) -> torch.Tensor:
-    """The nearest of several ranges of the same rays, 0 being none."""
+    """Returns the nearest of several ranges [m] of the same rays, 0 where all are 0."""
     ranges, *others = found
     for other in others:
-        ranges = other.where((ranges == 0) | (other > 0) & (other < ranges), ranges)
+        ranges = other.where(nearer(other, ranges), ranges)
     return ranges
 
 
 def _meshes(world: World) -> Sequence[Mesh]:
     meshes = [world] if isinstance(world, Mesh) else world
     if not meshes:
-        raise ValueError("world is empty; it should be a mesh or several")
+        raise ValueError("world is empty; it should be one mesh or several")
     return meshes
 
 
 def ranges(world: World, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
-    """Casts every ray of a sensor at each of several poses, by the engine that is faster for each mesh.
+    """Casts every ray of a sensor at each of several poses, with the engine that is faster for each mesh.
 
     Args:
-        world: Meshes, metres; what is nearest is measured.
-        sensor: Whose rays are cast.
+        world: Meshes in metres; the nearest hit counts.
+        sensor: The sensor whose rays are cast.
         poses: (..., 4, 4) transforms from the sensor frame to the world.
 
     Returns:
-        (..., H, W) float32 metres on the meshes' device; 0 where nothing is met between minimum and maximum range.
+        (..., H, W) float32 ranges [m] on the meshes' device; 0 where nothing is met between the sensor's minimum and
+        maximum range.
 
     Raises:
         ValueError: If there is no mesh, or a pose is not finite.
@@ -102,7 +105,7 @@ def ranges(world: World, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
 
 
 def _images(mesh: Mesh, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
-    """The ranges (N, H, W) of one mesh from poses (N, 4, 4)."""
+    """Returns the ranges (N, H, W) of one mesh from poses (N, 4, 4)."""
     tables = torch.tensor(sensor.elevations), torch.tensor(sensor.azimuths)
     directions, rays = sensor.directions().view(-1, 3), math.prod(sensor.shape)
     images = [torch.empty(0, *sensor.shape, device=mesh.device)]
@@ -114,21 +117,21 @@ def _images(mesh: Mesh, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
     return torch.cat(images)
 
 
-def simulate(world: World, sensor: Sensor, pose: torch.Tensor, effects: Effects | None = None, seed: int = 0) -> Scan:
-    """Casts every ray of a sensor.
+def scan(world: World, sensor: Sensor, pose: torch.Tensor, effects: Effects | None = None, seed: int = 0) -> Scan:
+    """Simulates one scan: casts every ray of a sensor.
 
     Args:
-        world: Meshes, metres; what is nearest is measured.
-        sensor: Whose rays are cast.
+        world: Meshes in metres; the nearest hit counts.
+        sensor: The sensor whose rays are cast.
         pose: (4, 4) transform from the sensor frame to the world; in the middle of the turn where the sensor moves.
-        effects: What a real sensor does to its measurements; nothing where None.
-        seed: Of their random numbers.
+        effects: What a real sensor does to its measurements; None for perfect ranges.
+        seed: Seed of the effects' random numbers.
 
     Returns:
-        The scan; 0 where nothing is met between the sensor's minimum and maximum range.
+        The scan, on the meshes' device; 0 where nothing is met between the sensor's minimum and maximum range.
 
     Raises:
-        ValueError: If there is no mesh, a pose is not finite, or the effects do not fit the sensor.
+        ValueError: If there is no mesh, the pose is not finite, or the effects do not fit the sensor.
     """
     if effects is None:
         return Scan(ranges(world, sensor, pose), sensor)

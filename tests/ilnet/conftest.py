@@ -6,7 +6,7 @@ import torch
 from tqdm import tqdm
 
 from ilnet.commands import cli
-from ilnet.world import places, towns
+from ilnet.world import places
 from kernels import Mesh
 
 
@@ -39,15 +39,13 @@ def yard(yard_on):
 
 
 @pytest.fixture(scope="session")
-def quiet_street():
-    """Makes a street of a mesh and waypoints too far from each other for traffic: nobody parks or walks there."""
+def quiet_place():
+    """Makes a place without traffic of waypoints in some triangles, by default those of the yard."""
 
-    def make(mesh, waypoints):
+    def make(waypoints, triangles=None):
+        corners, faces = triangles or yard_triangles()
         waypoints = np.asarray(waypoints, np.float32)
-        nobody = np.zeros((0, 4), np.float32)
-        headings = np.zeros(len(waypoints), np.float32)
-        town = towns.Town("yard", 0, np.zeros((0, 3)), np.zeros((0, 3)), waypoints, headings, nobody, nobody)
-        return places.Street(town, mesh)
+        return places.Place(corners.numpy(), faces.numpy(), waypoints, np.zeros(len(waypoints), np.float32))
 
     return make
 

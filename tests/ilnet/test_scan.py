@@ -493,7 +493,7 @@ def test_files_that_need_a_sensor(tmp_path, name):
         np.save(tmp_path / name, np.ones((4, 4)))
     else:
         write(tmp_path / name, toy())
-    with pytest.raises(ValueError, match=f"{name}: it does not say its sensor: name one"):
+    with pytest.raises(ValueError, match=f"{name}: it does not hold the angles of its rays; name the sensor"):
         read(tmp_path / name)
 
 

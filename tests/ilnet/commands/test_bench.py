@@ -80,9 +80,10 @@ def test_peak_memory_sees_what_is_taken_for_a_while():
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory is read from /proc")
 @pytest.mark.parametrize("precision", models.PRECISIONS)
 def test_a_frame_of_a_million_queries_takes_little_memory(precision, yard):
-    from ilnet.world.simulate import pose, simulate
+    from ilnet.world import simulate
+    from ilnet.world.simulate import pose
 
-    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
     upsampler = models.Upsampler(models.ILN(blocks=2).eval(), scan.sensor, scan.sensor.resize(256, 4096), precision)
     # MB; the authors' formulation takes 6000.
     assert bench.peak_memory(lambda: [upsampler.ranges(scan)], torch.device("cpu")) < 400

@@ -6,23 +6,24 @@ import pytest
 from ilnet import data, models
 from ilnet.commands import experiment
 from ilnet.learning import evaluate, metrics, train
-from ilnet.sensor import preset
-from ilnet.world.simulate import pose, simulate
+from ilnet.sensor import PAPER_INPUT, preset
+from ilnet.world import simulate
+from ilnet.world.simulate import pose
 
 
 @pytest.fixture
-def study(tmp_path, monkeypatch, yard, quiet_street):
+def study(tmp_path, monkeypatch, yard, quiet_place):
     """Experiments in the yard, with networks and budgets of a size for tests."""
-    street = quiet_street(yard, [[3, 0, 0]])
+    place = quiet_place([[3, 0, 0]])
 
     def pairs(town, count, output):
-        return [tuple(simulate(yard, sensor, pose((3.0, 0.0, 1.8))) for sensor in (evaluate.INPUT, output))] * count
+        return [tuple(simulate.scan(yard, sensor, pose((3.0, 0.0, 1.8))) for sensor in (PAPER_INPUT, output))] * count
 
-    monkeypatch.setattr(train.places, "street", lambda *args: street)
+    monkeypatch.setattr(train.places, "town", lambda *args: place)
     monkeypatch.setattr(evaluate, "town_pairs", pairs)
     monkeypatch.setattr(train, "HELD_OUT", {"town01": 1})
     monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
-    monkeypatch.setattr(train, "OUTPUT", train.INPUT)  # a quarter of the work of each validation
+    monkeypatch.setattr(train, "VALIDATION", PAPER_INPUT)  # a quarter of the work of each validation
     monkeypatch.setattr(train, "VALIDATE_EVERY", (2, 2))
     monkeypatch.setattr(experiment, "SIZES", ((16, 256), (32, 512)))
     tables = experiment.PAPER["64x1024"], experiment.PAPER["128x2048"]
@@ -102,7 +103,7 @@ def test_ablations_and_measured_scans(study, tmp_path, yard):
     from ilnet import scan_files
 
     frame = tmp_path / "frame.npz"
-    scan_files.write(frame, simulate(yard, preset("os1-32").resize(32, 256), pose((3.0, 0.0, 1.8))))
+    scan_files.write(frame, simulate.scan(yard, preset("os1-32").resize(32, 256), pose((3.0, 0.0, 1.8))))
     study = experiment.Study("tiny", study.out, 1, 1, measured=(frame,))
     for name in ("attention", "prior", "real"):
         experiment.EXPERIMENTS[name](study)

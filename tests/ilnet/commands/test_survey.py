@@ -11,10 +11,11 @@ from click.testing import CliRunner
 
 from ilnet import scan_files
 from ilnet.commands.cli import cli
-from ilnet.commands.survey import RANGE_BINS, SLOPE_BINS, ground_height, statistics, survey
+from ilnet.commands.survey import RANGE_BINS, SLOPE_BINS, compare, ground_height, statistics
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
-from ilnet.world.simulate import pose, simulate
+from ilnet.world import simulate
+from ilnet.world.simulate import pose
 from kernels import Mesh
 
 HEIGHT = 2.0
@@ -137,14 +138,14 @@ def files(tmp_path):
     mesh.save(tmp_path / "yard.ply")
     sensor = replace(CIRCLE, elevations=np.deg2rad(np.linspace(-25, 15, 48)), azimuths=CIRCLE.azimuths[::2])
     surroundings = Mesh(mesh.points, mesh.regular_faces)
-    scan_files.write(tmp_path / "measured.npz", simulate(surroundings, sensor, pose((3.0, -2.0, 2.5))))
+    scan_files.write(tmp_path / "measured.npz", simulate.scan(surroundings, sensor, pose((3.0, -2.0, 2.5))))
     place = {"sensor_height_m": 1.2, "positions": [[3.0, -2.0, 1.2], [3.0, -2.0, 1.2]]}
     (tmp_path / "yard.json").write_text(json.dumps(place))
     return tmp_path
 
 
 def test_a_mesh_is_seen_from_the_height_of_the_measured_scan(files):
-    measured, simulated = survey([files / "measured.npz"], [(files / "yard.ply", files / "yard.json")], [])
+    measured, simulated = compare([files / "measured.npz"], [(files / "yard.ply", files / "yard.json")], [])
     assert (measured.kind, simulated.kind) == ("measured", "mesh")
     assert (measured.sensor, simulated.sensor) == ("measured", "measured")
     assert simulated.source == "yard"
@@ -185,7 +186,7 @@ def test_survey_prints_a_table_and_draws(files):
 def test_bad_positions(files, content, message):
     (files / "bad.json").write_text(content)
     with pytest.raises(ValueError, match=message):
-        survey([], [(files / "yard.ply", files / "bad.json")], [])
+        compare([], [(files / "yard.ply", files / "bad.json")], [])
 
 
 def test_options_that_do_not_fit():

@@ -7,7 +7,8 @@ import torch
 from ilnet import models, scan_files
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
-from ilnet.world.simulate import pose, simulate
+from ilnet.world import simulate
+from ilnet.world.simulate import pose
 
 SENSOR = preset("paper-16x1024").resize(8, 128)
 
@@ -23,7 +24,7 @@ def run(command):
 
 @pytest.fixture
 def seen(tmp_path, yard):
-    seen = simulate(yard, SENSOR, pose((0.0, 0.0, 1.8)))
+    seen = simulate.scan(yard, SENSOR, pose((0.0, 0.0, 1.8)))
     scan_files.write(tmp_path / "in.npz", seen)
     return seen
 
@@ -57,7 +58,7 @@ def test_a_folder_of_several_sensors(run, seen, tmp_path):
 
 def test_points_by_the_angles_of_their_sensor(run, yard, tmp_path):
     (tmp_path / "in").mkdir()
-    seen = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    seen = simulate.scan(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
     scan_files.write(tmp_path / "in" / "a.pcd", seen)
     options = ("--sensor", "paper-64x1024", "--model", "bilinear", "--from", "paper-16x1024", "--format", "ply")
     assert run("in", "out", *options)[0] == 0
@@ -123,6 +124,6 @@ def test_bad_input_is_one_line_and_exit_code_2(run, seen, tmp_path, arguments, m
 
 def test_an_uneven_sensor_keeps_its_field_of_view(run, tmp_path, yard):
     uneven = Sensor(np.deg2rad([-15.0, -8.0, -3.0, 0.0, 2.0]), np.deg2rad(np.arange(0.0, 90.0, 1.0)))
-    scan_files.write(tmp_path / "in.npz", simulate(yard, uneven, pose((0.0, 0.0, 1.8))))
+    scan_files.write(tmp_path / "in.npz", simulate.scan(yard, uneven, pose((0.0, 0.0, 1.8))))
     assert run("in.npz", "out.npz", "--size", "10x180", "--model", "bilinear")[0] == 0
     assert scan_files.read(tmp_path / "out.npz").sensor == uneven.resize(10, 180)

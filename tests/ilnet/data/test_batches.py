@@ -8,19 +8,18 @@ from torch.utils.data import DataLoader
 from ilnet import data
 from ilnet.sensor import preset
 from ilnet.world import places, simulate
-from kernels import Mesh
 
 SENSOR = preset("paper-16x1024")
 
 
 @pytest.fixture(scope="module")
-def streets(quiet_street):
+def streets(quiet_place):
     """Two flat worlds whose ground lies at different heights, so that a ray tells where it was cast."""
     corners = torch.tensor([[-500.0, -500, 0], [500, -500, 0], [500, 500, 0], [-500, 500, 0]])
     triangles = torch.tensor([[0, 1, 2], [0, 2, 3]])
     lifts = (torch.tensor([0.0, 0, z]) for z in (0, 7))
     waypoints = torch.tensor([[-100.0, 0, 0], [100, 0, 0]])
-    return [quiet_street(Mesh(corners + lift, triangles), waypoints + lift) for lift in lifts]
+    return [quiet_place(waypoints + lift, (corners + lift, triangles)) for lift in lifts]
 
 
 def rays(streets, seed=0):
@@ -86,7 +85,7 @@ def test_sensors_sway_and_stand_at_their_height(streets):
 
 
 def test_held_out_scans_come_from_waypoints_spread_over_the_town():
-    street = places.street("town01", 0)
+    street = places.town("town01", 0)
     pairs = places.held_out_scans(street, 3, [SENSOR, preset("paper-64x1024")])
     assert [[s.ranges.shape for s in pair] for pair in pairs] == [[(16, 1024), (64, 1024)]] * 3
     for scan, dense in pairs:
@@ -99,12 +98,10 @@ def test_held_out_scans_come_from_waypoints_spread_over_the_town():
 
 def test_every_scan_meets_other_traffic():
     """A sensor that stays where it is measures another world, unless the seed is the same."""
-    street = places.street("town01")
+    street = places.town("town01")
     pose = street.pose(400)
-    first, again, other = (
-        simulate.simulate(street.world(pose[:3, 3], seed), SENSOR, pose).ranges for seed in (0, 0, 1)
-    )
-    empty = simulate.simulate(street.mesh, SENSOR, pose).ranges
+    first, again, other = (simulate.scan(street.world(pose[:3, 3], seed), SENSOR, pose).ranges for seed in (0, 0, 1))
+    empty = simulate.scan(street.mesh, SENSOR, pose).ranges
     assert torch.equal(first, again)
     assert 0.002 < (first != other).double().mean() < 0.4
     nearer = (first > 0) & ((empty == 0) | (first < empty))
@@ -114,12 +111,10 @@ def test_every_scan_meets_other_traffic():
 
 def test_continuous_rays_meet_the_traffic_of_their_own_crop(monkeypatch):
     """What crops measure is what one crop alone measures in the world it stands in."""
-    street = places.street("town01")
+    street = places.town("town01")
     drawn, casts = [], []
-    draw, cast = data.batches.towns.traffic, simulate.cast
-    monkeypatch.setattr(
-        data.batches.towns, "traffic", lambda *args, **sector: drawn.append(args) or draw(*args, **sector)
-    )
+    draw, cast = places.towns.traffic, simulate.cast
+    monkeypatch.setattr(places.towns, "traffic", lambda *args, **sector: drawn.append(args) or draw(*args, **sector))
     monkeypatch.setattr(simulate, "cast", lambda *args: casts.append(args) or cast(*args))
     batch = next(iter(data.ContinuousRays([street], SENSOR, crops=5, columns=96, queries=300, seed=3)))
     monkeypatch.undo()
@@ -147,7 +142,7 @@ def test_any_number_of_workers_gives_the_same_batches(streets, workers):
 
 
 def test_parts_of_a_batch_make_up_the_whole():
-    street = places.street("town01")
+    street = places.town("town01")
 
     def first(part):
         return next(iter(data.ContinuousRays([street], SENSOR, 4, 64, 50, seed=2, start=3, part=part)))

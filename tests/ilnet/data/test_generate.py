@@ -10,22 +10,25 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from ilnet.commands import cli
+from ilnet.commands import cli, options
 from ilnet.data import generate, open_archive
 from ilnet.data.archive import UNIT
-from ilnet.world import simulate, towns
+from ilnet.sensor import PAPER_INPUT, preset
+from ilnet.world import places, simulate, towns
 from ilnet.world.places import SENSOR_HEIGHT
-from ilnet.world.places import street as street_of
 from kernels import Mesh
 
 from ..conftest import yard_triangles
 
 SIZES = ("4x64", "16x128")
+SENSORS = [PAPER_INPUT.resize(4, 64), PAPER_INPUT.resize(16, 128)]
+YARDS = {name: generate.Recipe(9, lambda: yard()) for name in ("yard", "yard again")}
 SCANS = 3 * UNIT + 3
 on_cpu = pytest.mark.skipif(torch.cuda.is_available(), reason="on CUDA one process does all")
 
@@ -33,12 +36,12 @@ on_cpu = pytest.mark.skipif(torch.cuda.is_available(), reason="on CUDA one proce
 @functools.cache
 def yard():
     waypoints = np.array([[x, y, 0.0] for x in (-40, -20, 1) for y in (-30, 0, 30)])
-    return generate.Place(*(array.numpy() for array in yard_triangles()), waypoints)
+    return places.Place(*(array.numpy() for array in yard_triangles()), waypoints, np.zeros(9))
 
 
 def make(out, seed=5, **how):
-    how = {"places": {"yard": (9, yard), "yard again": (9, yard)}, "workers": 1, **how}
-    return generate.generate(out, scans=SCANS, sensors=generate.sensors_of_sizes(SIZES), seed=seed, **how)
+    how = {"recipes": YARDS, "workers": 1, **how}
+    return generate.generate(out, scans=SCANS, sensors=SENSORS, seed=seed, **how)
 
 
 def files(folder):
@@ -57,7 +60,7 @@ def test_a_scan_is_what_the_sensor_measures_at_its_pose(undisturbed):
     for number in (0, UNIT, SCANS - 1):
         for size in SIZES:
             scan = archive.scan(number, size)
-            truth = simulate.simulate(Mesh(*yard_triangles()), scan.sensor, archive.pose(number)).ranges
+            truth = simulate.scan(Mesh(*yard_triangles()), scan.sensor, archive.pose(number)).ranges
             assert (scan.ranges - truth).abs().max() <= 0.001
             assert (scan.ranges > 0).float().mean() > 0.4
 
@@ -88,12 +91,12 @@ def test_the_seed_decides(undisturbed, tmp_path):
 
 
 def test_all_sizes_see_the_same_traffic_and_each_scan_its_own(tmp_path):
-    sensors = generate.sensors_of_sizes(["16x1024", "64x1024"])
-    archive = generate.generate(tmp_path / "scans", generate.town_places(["town01"]), 3, sensors, seed=4)
-    street = street_of("town01")
+    sensors = [PAPER_INPUT, preset("paper-64x1024")]
+    archive = generate.generate(tmp_path / "scans", generate.town_places([("town01", 0)]), 3, sensors, seed=4)
+    town = places.town("town01")
     for number in range(3):
         pose = archive.pose(number)
-        own, other = (street.world(pose[:3, 3], [4, k]) for k in (number, number + 1))
+        own, other = (town.world(pose[:3, 3], [4, k]) for k in (number, number + 1))
         for size, sensor in archive.sensors.items():
             ranges = archive.scan(number, size).ranges
             difference = (ranges - simulate.ranges(own, sensor, pose)).abs()
@@ -102,7 +105,7 @@ def test_all_sizes_see_the_same_traffic_and_each_scan_its_own(tmp_path):
 
 
 def test_effects_are_those_of_each_scan(tmp_path):
-    effects = generate.effects_of(["range_noise=0.05", "velocity=1,0,0"])
+    effects = options.effects(["range_noise=0.05", "velocity=1,0,0"])
     noisy = make(tmp_path / "noisy", effects=effects)
     clean = simulate.ranges(Mesh(*yard_triangles()), noisy.sensors["16x128"], noisy.pose(0))
     error = [(noisy.scan(k, "16x128").ranges - clean) for k in (0, 1)]
@@ -113,14 +116,14 @@ def test_effects_are_those_of_each_scan(tmp_path):
         make(tmp_path / "noisy")
     for wrong, message in (("fog=1", "--effect is 'fog=1'.*range_noise, "), ("dropout_range=2", "dropout_range is 2")):
         with pytest.raises(ValueError, match=message):
-            generate.effects_of([wrong])
+            options.effects([wrong])
 
 
 def test_towns_take_scans_by_their_waypoints(tmp_path):
     """So that as many scans as there are waypoints take every one once."""
-    built = yard()
-    fewer = built._replace(waypoints=built.waypoints[:3])
-    archive = make(tmp_path / "scans", places={"nine": (9, yard), "three": (3, lambda: fewer)})
+    fewer = replace(yard(), waypoints=yard().waypoints[:3], headings=np.zeros(3))
+    recipes = {"nine": generate.Recipe(9, yard), "three": generate.Recipe(3, lambda: fewer)}
+    archive = make(tmp_path / "scans", recipes=recipes)
     count = [archive.town(k) for k in range(SCANS)].count("nine")
     assert count == -(-SCANS * 9 // 12) or count == SCANS * 9 // 12
     assert sum(towns.WAYPOINTS[name] for name in towns.TRAIN) == 22_244
@@ -154,9 +157,9 @@ def test_only_towns_that_are_needed_are_built(tmp_path, undisturbed):
     def never():
         raise AssertionError
 
-    make(out, places={"yard": (9, yard), "yard again": (9, never)})
+    make(out, recipes=YARDS | {"yard again": generate.Recipe(9, never)})
     assert files(out) == files(undisturbed.path)
-    make(out, places={"yard": (9, never), "yard again": (9, never)})
+    make(out, recipes=dict.fromkeys(YARDS, generate.Recipe(9, never)))
 
 
 def test_a_full_disk_stops_it_with_one_line_and_it_goes_on(tmp_path, undisturbed):
@@ -287,9 +290,9 @@ def test_a_mesh_that_does_not_serve_is_one_line(tmp_path, mesh_file, monkeypatch
     [
         (["--towns", "town99"], "--towns names 'town99'; it should be one of town01"),
         (["--towns", "town01:x"], "--towns names 'town01:x'"),
-        (["--towns", "town01,town01"], "names town01 twice"),
-        (["--sizes", "64"], "--sizes has '64'; it should be rows x columns"),
-        (["--sizes", "1x64"], "rows and columns must be at least 2"),
+        (["--towns", "town01,town01"], "wanted has town01 twice"),
+        (["--sizes", "64"], "--sizes: size is '64'; it should be rows x columns"),
+        (["--sizes", "1x64"], "size is '1x64'; it should be rows x columns, at least 2 of each"),
         (["--sizes", "4x64,4x64"], "two sensors have 4x64 rays"),
         (["--sensor", "vlp-61"], "unknown sensor 'vlp-61'"),
         (["--sensor", "vlp-16", "--sizes", "4x64"], "exclude each other"),

@@ -12,16 +12,16 @@ from torch.utils.data import get_worker_info
 
 from ilnet import data, models
 from ilnet.learning import metrics, train
-from ilnet.sensor import preset
-from ilnet.world import places
-from ilnet.world.simulate import pose, simulate
+from ilnet.sensor import PAPER_INPUT, preset
+from ilnet.world import places, simulate
+from ilnet.world.simulate import pose
 
 
 @pytest.fixture
-def quick(monkeypatch, yard, quiet_street):
+def quick(monkeypatch, quiet_place):
     """Training in the yard, with a network and batches of a size for tests."""
-    street = quiet_street(yard, [[3, 0, 0]])
-    monkeypatch.setattr(train.places, "street", lambda *args: street)
+    place = quiet_place([[3, 0, 0]])
+    monkeypatch.setattr(train.places, "town", lambda *args: place)
     monkeypatch.setattr(train, "HELD_OUT", {"town01": 1})
     monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
     size = train.Preset(blocks=1, steps=4, crops=2, columns=32, queries=64, towns=("town01",))
@@ -119,18 +119,15 @@ def test_the_figures_are_those_of_the_final_weights(tmp_path, quick, monkeypatch
     monkeypatch.setattr(train, "VALIDATE_EVERY", (3, 3))
     figures = quick(tmp_path, steps=5)
     model = models.load(tmp_path / "iln-prior.safetensors")
-    street = train.places.street()
-    sensors = [preset(train.INPUT), preset(train.OUTPUT)]
-    [[scan, truth]] = places.held_out_scans(street, 1, sensors)
+    [[scan, truth]] = places.held_out_scans(train.places.town(), 1, [PAPER_INPUT, train.VALIDATION])
     mae = metrics.compare(model.ranges(scan, truth.sensor), truth)["mae"]
     assert mae == pytest.approx(figures["val/mae"], rel=0.05)  # float32 here, bfloat16 there
 
 
-def test_training_lowers_the_loss(yard, quiet_street):
+def test_training_lowers_the_loss(quiet_place):
     torch.manual_seed(0)
     model = models.create("iln", features=16, blocks=1, heads=4, dropout=0.0)
-    street = quiet_street(yard, [[3, 0, 0]])
-    batch = next(iter(data.ContinuousRays([street], preset("paper-16x1024"), 4, 64, 256, seed=0)))
+    batch = next(iter(data.ContinuousRays([quiet_place([[3, 0, 0]])], PAPER_INPUT, 4, 64, 256, seed=0)))
     training = train.Training(model, [], 1e-3)
     training.log = lambda *args, **kwargs: None
     optimizer = torch.optim.Adam(model.parameters(), 3e-3)
@@ -163,7 +160,7 @@ def test_the_head_of_a_network_with_a_prior_gets_a_gradient(yard):
     """Zero scores at the start must not be a dead end."""
     model = models.create("iln-prior", features=16, blocks=1, heads=4)
     here = pose((0.0, 0.0, 1.8))
-    image = simulate(yard, preset("paper-16x1024"), here).filled().unsqueeze(0)
+    image = simulate.scan(yard, preset("paper-16x1024"), here).filled().unsqueeze(0)
     queries = torch.rand(1, 500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([15.0, 1024.0])
     model(image, queries).sum().backward()
     assert model.head[1].weight.grad.abs().max() > 0
@@ -237,5 +234,5 @@ def test_lidar_sr_learns_the_one_size_that_it_predicts(tmp_path, quick, yard):
     assert set(figures) == {f"val/{name}" for name in metrics.FIGURES}
     model = models.load(tmp_path / "lidar-sr.safetensors")
     assert (model.rows, model.columns) == (4, 1)
-    scan = simulate(yard, sensors["16x1024"], pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, sensors["16x1024"], pose((0.0, 0.0, 1.8)))
     assert model.upsample(scan, sensors["64x1024"]).sensor.shape == (64, 1024)

@@ -20,7 +20,8 @@ from ilnet.models import base
 from ilnet.models.encoder import Encoder
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
-from ilnet.world.simulate import pose, simulate
+from ilnet.world import simulate
+from ilnet.world.simulate import pose
 from kernels import reference
 from kernels.checks import PRIORS
 
@@ -63,7 +64,7 @@ def test_lidar_sr_predicts_its_own_size_and_refuses_others(yard):
     torch.manual_seed(0)
     model = models.create("lidar-sr", rows=4, columns=2).eval()
     source = preset("paper-16x1024").resize(8, 32)
-    scan = simulate(yard, source, pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, source, pose((0.0, 0.0, 1.8)))
     target = source.resize(32, 64)
     dense = model.ranges(scan, target)
     # Each query of the grid gets the pixel of its own, the seam included.
@@ -221,7 +222,7 @@ def test_upsample_to_any_sensor(name, yard):
     torch.manual_seed(0)
     arguments = {"features": 16, "blocks": 1} if name in models.TRAINABLE else {}
     model = models.create(name, **arguments).eval()
-    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
     uneven = Sensor(np.deg2rad([-14.9, -3.0, -2.5, 0.0, 11.0]), np.deg2rad([170, 100, 95, -20, -40.5]))
     for target in (preset("paper-64x1024"), scan.sensor.resize(33, 500), uneven):
         dense = model.upsample(scan, target)
@@ -235,7 +236,7 @@ def test_upsample_to_any_sensor(name, yard):
 def test_networks_see_every_sensor_upright(flips, yard):
     """Ouster and Velodyne store the highest beam first; networks were trained with the lowest first."""
     model, source, target = small("bilinear"), preset("paper-16x1024"), preset("paper-64x1024")
-    scan = simulate(yard, source, pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, source, pose((0.0, 0.0, 1.8)))
 
     def flip(sensor):
         elevations, azimuths = (
@@ -252,14 +253,14 @@ def test_networks_see_every_sensor_upright(flips, yard):
 
 def test_upsample_does_not_depend_on_the_chunk(yard, monkeypatch):
     model = small("bilinear")
-    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
     expected = model.ranges(scan, preset("paper-64x1024"))
     monkeypatch.setitem(base._TILE, "cpu", 777)
     torch.testing.assert_close(model.ranges(scan, preset("paper-64x1024")), expected, rtol=0, atol=METRES)
 
 
 def test_upsample_decodes_in_pieces_of_bounded_size(yard):
-    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
     model, sizes = models.create("bilinear"), []
     decode = model.decode
     model.decode = lambda e, i, queries, w: sizes.append(queries.shape[1]) or decode(e, i, queries, w)
@@ -275,7 +276,7 @@ def test_a_network_answers_alike_in_training_in_a_frame_and_in_plain_torch(depth
     torch.manual_seed(0)
     model = models.ILN(depth, "perspective", blocks=1).train(training)
     torch.nn.init.normal_(model.head[1].weight, std=0.5)
-    scan = simulate(yard, preset("paper-16x1024").resize(8, 128), pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, preset("paper-16x1024").resize(8, 128), pose((0.0, 0.0, 1.8)))
     target = scan.sensor.resize(20, 300)
     queries = scan.sensor.grid_queries(target).view(1, -1, 2)
     image = scan.filled().unsqueeze(0)
@@ -302,7 +303,7 @@ def test_dropout_is_active_in_training_only(yard):
 def test_bfloat16_is_close_and_ranges_stay_float32(name, yard):
     torch.manual_seed(0)
     model = models.create(name, blocks=4).eval() if name in models.TRAINABLE else models.create(name)
-    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
     exact = model.ranges(scan, preset("paper-64x1024"))
     rounded = model.ranges(scan, preset("paper-64x1024"), "bfloat16")
     assert rounded.dtype == torch.float32
@@ -325,11 +326,11 @@ def test_an_upsampler_serves_many_frames_of_its_sensor_only(yard):
     source, target = preset("paper-16x1024"), preset("paper-64x1024")
     upsampler = models.Upsampler(model, source, target)
     for x in (0.0, 3.0):
-        scan = simulate(yard, source, pose((x, 0.0, 1.8)))
+        scan = simulate.scan(yard, source, pose((x, 0.0, 1.8)))
         assert torch.equal(upsampler(scan).ranges, model.upsample(scan, target).ranges)
         assert upsampler(scan).sensor == target
     with pytest.raises(ValueError, match=r"scan is of Sensor\(paper-64x1024.*; it should be of Sensor\(paper-16x1024"):
-        upsampler(simulate(yard, target, pose((0.0, 0.0, 1.8))))
+        upsampler(simulate.scan(yard, target, pose((0.0, 0.0, 1.8))))
     with pytest.raises(ValueError, match="precision is 'half'; it should be one of float32, bfloat16"):
         models.Upsampler(model, source, target, "half")
 
@@ -343,7 +344,7 @@ def on(device, scan):
 
 def test_a_model_elsewhere_than_its_scans_is_refused(yard):
     model, source, target = small(), preset("paper-16x1024").resize(8, 64), preset("paper-64x1024").resize(16, 64)
-    scan = simulate(yard, source, pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, source, pose((0.0, 0.0, 1.8)))
     elsewhere = r"model is on cpu; it should be on meta, where the scans are: call model.to\('meta'\)"
     for call in (model.ranges, model.upsample):
         with pytest.raises(ValueError, match=elsewhere):
@@ -448,7 +449,7 @@ def test_on_cuda_frames_replay_a_graph_without_waiting(precision, yard):
     torch.manual_seed(0)
     model = models.ILN(blocks=2).eval()
     source, target = preset("paper-16x1024"), preset("paper-64x1024")
-    scans = [simulate(yard, source, pose((x, 0.0, 1.8))) for x in (0.0, 3.0, 6.0)]
+    scans = [simulate.scan(yard, source, pose((x, 0.0, 1.8))) for x in (0.0, 3.0, 6.0)]
     expected = [model.ranges(scan, target) for scan in scans]
     upsampler = models.Upsampler(model.cuda(), source, target, precision, "cuda")
     moved = [Scan(scan.ranges.cuda(), source) for scan in scans]
@@ -473,7 +474,7 @@ def test_on_cuda_threads_and_streams_share_an_upsampler(yard):
     torch.manual_seed(0)
     model = models.ILN(blocks=2).eval().cuda()
     source, target = preset("paper-16x1024"), preset("paper-64x1024")
-    scans = [simulate(yard, source, pose((float(x), 0.0, 1.8))) for x in range(12)]
+    scans = [simulate.scan(yard, source, pose((float(x), 0.0, 1.8))) for x in range(12)]
     moved = [Scan(scan.ranges.cuda(), source) for scan in scans]
     expected = [model.ranges(scan, target) for scan in moved]
     upsampler = models.Upsampler(model, source, target, device="cuda")
@@ -494,7 +495,7 @@ def test_on_cuda_threads_and_streams_share_an_upsampler(yard):
 def test_on_cuda_a_frame_stays_on_a_device_that_is_not_the_current_one(yard):
     model = small().to("cuda:1")
     source, target = preset("paper-16x1024"), preset("paper-64x1024")
-    scan = simulate(yard, source, pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, source, pose((0.0, 0.0, 1.8)))
     upsampler = models.Upsampler(model, source, target, device="cuda:1")
     moved = Scan(scan.ranges.to("cuda:1"), source)
     answers = [upsampler.ranges(moved) for _ in range(3)]
@@ -504,8 +505,8 @@ def test_on_cuda_a_frame_stays_on_a_device_that_is_not_the_current_one(yard):
 
 def test_bilinear_upsampling_is_close_to_the_truth_on_the_ground(yard):
     here = pose((60.0, -60.0, 1.8))
-    scan = simulate(yard, preset("paper-16x1024"), here)
-    truth = simulate(yard, preset("paper-64x1024"), here)
+    scan = simulate.scan(yard, preset("paper-16x1024"), here)
+    truth = simulate.scan(yard, preset("paper-64x1024"), here)
     for name, metres in (("bilinear", 0.7), ("bilinear-inverse", 0.02), ("planes", 0.02)):
         dense = models.create(name).ranges(scan, truth.sensor)
         near = (truth.ranges > 0) & (truth.ranges < 15)
@@ -514,7 +515,7 @@ def test_bilinear_upsampling_is_close_to_the_truth_on_the_ground(yard):
 
 
 def test_rays_out_of_view_hold_no_return(yard):
-    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
     steep = Sensor(np.deg2rad([-60.0, -10.0]), np.deg2rad([0.0, 10.0]))
     dense = models.create("bilinear").upsample(scan, steep)
     assert (dense.ranges[0] == 0).all()
@@ -539,8 +540,8 @@ def test_a_scan_without_returns_gives_none():
 @pytest.mark.parametrize("name", demo.METHODS)
 def test_shipped_models_load_and_predict(name, yard):
     model = models.load(name)
-    scan = simulate(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
-    truth = simulate(yard, preset("paper-64x1024"), pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    truth = simulate.scan(yard, preset("paper-64x1024"), pose((0.0, 0.0, 1.8)))
     ranges = model.ranges(scan, truth.sensor)
     # An upper bound for the nearest pixel, the worst of them; no return counts as 100 m.
     assert (ranges - truth.filled()).abs().mean() < 1.5

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from ilnet.sensor import Sensor, preset
+from ilnet.world import simulate
 from ilnet.world.effects import RANGE_RESOLUTION, REFERENCE_RANGE, Effects, simulate_with
-from ilnet.world.simulate import cast, pose, simulate
+from ilnet.world.simulate import cast, pose
 from kernels import Mesh
 
 # float32 of coordinates up to 100 m.
@@ -73,7 +74,7 @@ def test_without_effects_it_is_the_plain_scan_bit_for_bit(name, device):
 def test_the_nearest_hit_of_all_meshes_counts(device):
     near, far = plates(wall(8.0, 0.0), device=device), plates(wall(20.0), device=device)
     both = plates(wall(8.0, 0.0), wall(20.0), device=device)
-    expected = simulate(both, FRONT, ORIGIN).ranges
+    expected = simulate.scan(both, FRONT, ORIGIN).ranges
     assert (expected < 15).any()
     assert (expected > 15).any()
     for meshes in ([near, far], [far, near]):

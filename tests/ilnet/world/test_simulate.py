@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from ilnet.sensor import Sensor, preset
-from ilnet.world import meshes, places
-from ilnet.world.simulate import Effects, cast, pose, ranges, simulate
+from ilnet.world import meshes, places, simulate
+from ilnet.world.effects import Effects
+from ilnet.world.simulate import cast, pose, ranges
 from kernels import Mesh
 
 # float32 of coordinates up to 100 m.
@@ -35,7 +36,7 @@ def test_poses_come_in_batches_and_are_rotations():
 
 def test_flat_ground_by_hand(yard):
     sensor = Sensor(torch.deg2rad(torch.tensor([-30.0, -1.0, 10.0])), torch.deg2rad(torch.arange(-170.0, 190.0, 20.0)))
-    scan = simulate(yard, sensor, pose((0.0, -60.0, 1.8)))
+    scan = simulate.scan(yard, sensor, pose((0.0, -60.0, 1.8)))
     torch.testing.assert_close(scan.ranges[0], torch.full((18,), 1.8 / math.sin(math.radians(30))), rtol=0, atol=METRES)
     assert (scan.ranges[1, scan.ranges[1] > 0] < 80).all()  # 103 m away along -1°, beyond the maximum range
     assert (scan.ranges[2] == 0).float().mean() > 0.5
@@ -45,7 +46,7 @@ def test_a_block_stands_where_it_stands_whatever_the_yaw(yard):
     sensor = preset("paper-16x1024")
     for yaw in (0.0, 1.0, -2.5):
         turn = pose((0.0, 0.0, 1.8), yaw)
-        points = simulate(yard, sensor, turn).points().double()
+        points = simulate.scan(yard, sensor, turn).points().double()
         world = points @ turn[:3, :3].T + turn[:3, 3]
         near = world[(world[:, 0] - 10).abs() < METRES]
         assert len(near) > 50  # the block's face at x = 10
@@ -55,19 +56,19 @@ def test_a_block_stands_where_it_stands_whatever_the_yaw(yard):
 
 def test_nothing_nearer_than_the_minimum_range(yard):
     sensor = Sensor(torch.tensor([-1.0, -0.5]), torch.tensor([0.0, 0.1]), min_range=3.0)
-    ranges = simulate(yard, sensor, pose((50.0, 50.0, 1.8))).ranges
+    ranges = simulate.scan(yard, sensor, pose((50.0, 50.0, 1.8))).ranges
     assert (ranges[0] == 0).all()
     torch.testing.assert_close(ranges[1], torch.full((2,), 1.8 / math.sin(0.5)), rtol=0, atol=METRES)
 
 
 def test_a_missing_direction_shows_as_no_return(yard):
     high = Sensor(torch.tensor([0.7, 0.8]), torch.tensor([0.0, 0.1]))
-    assert not simulate(yard, high, pose((60.0, 60.0, 1.8))).ranges.any()
+    assert not simulate.scan(yard, high, pose((60.0, 60.0, 1.8))).ranges.any()
 
 
 @pytest.mark.parametrize("size", ["paper-16x1024", "paper-64x1024", "paper-128x2048", "os1-128"])
 def test_presets_scan_the_yard(yard, size):
-    scan = simulate(yard, preset(size), pose((0.0, 0.0, 1.8)))
+    scan = simulate.scan(yard, preset(size), pose((0.0, 0.0, 1.8)))
     assert scan.ranges.shape == preset(size).shape
     assert scan.ranges.any()
 
@@ -77,8 +78,8 @@ def test_what_is_nearest_of_several_meshes_is_measured(yard):
         torch.tensor([[6.0, -9, 0], [6, 9, 0], [6, 9, 1.6], [6, -9, 1.6]]), torch.tensor([[0, 1, 2], [0, 2, 3]])
     )
     sensor, here = preset("paper-16x1024"), pose((0.0, 0.0, 1.8))
-    one, other = (simulate(mesh, sensor, here).ranges for mesh in (yard, wall))
-    both = simulate([yard, wall], sensor, here).ranges
+    one, other = (simulate.scan(mesh, sensor, here).ranges for mesh in (yard, wall))
+    both = simulate.scan([yard, wall], sensor, here).ranges
     assert torch.equal(both, torch.where((other > 0) & ((one == 0) | (other < one)), other, one))
     assert ((both == one) & (both > 0)).any()
     assert ((both == other) & (both > 0)).any()
@@ -87,7 +88,7 @@ def test_what_is_nearest_of_several_meshes_is_measured(yard):
 def test_what_is_too_near_hides_what_is_behind(yard):
     near = Mesh(torch.tensor([[1.0, -1, 1], [1, 1, 1], [1, 0, 3]]), torch.tensor([[0, 1, 2]]))
     sensor = Sensor(torch.tensor([-0.1, -0.08]), torch.tensor([0.0, 2.0]))
-    open_, hidden = (simulate(world, sensor, pose((0.0, 0.0, 1.8))).ranges for world in (yard, [yard, near]))
+    open_, hidden = (simulate.scan(world, sensor, pose((0.0, 0.0, 1.8))).ranges for world in (yard, [yard, near]))
     assert (open_[:, 0] > 2).all()
     assert (hidden[:, 0] == 0).all()
     assert torch.equal(hidden[:, 1], open_[:, 1])
@@ -100,7 +101,7 @@ def test_many_poses_are_cast_in_one_call(yard_on, size, device):
     many = ranges(mesh, sensor, poses)
     assert many.shape == (3, *sensor.shape)
     for image, one in zip(many, poses, strict=True):
-        assert torch.equal(image, simulate(mesh, sensor, one).ranges)
+        assert torch.equal(image, simulate.scan(mesh, sensor, one).ranges)
     assert ranges(mesh, sensor, poses.view(3, 1, 4, 4)).shape == (3, 1, *sensor.shape)
     assert ranges(mesh, sensor, poses[:0]).shape == (0, *sensor.shape)
     assert torch.equal(ranges(mesh, sensor, poses.mT.contiguous().mT), many)  # in any order of memory
@@ -122,8 +123,8 @@ def test_the_engine_follows_the_work(yard):
 def test_effects_are_drawn_from_the_seed(yard):
     sensor, here = preset("paper-16x1024"), pose((0.0, 0.0, 1.8))
     noisy = Effects(range_noise=0.02, intensity=True)
-    first, again, other = (simulate(yard, sensor, here, noisy, seed) for seed in (1, 1, 2))
-    clean = simulate(yard, sensor, here).ranges
+    first, again, other = (simulate.scan(yard, sensor, here, noisy, seed) for seed in (1, 1, 2))
+    clean = simulate.scan(yard, sensor, here).ranges
     assert torch.equal(first.ranges, again.ranges)
     assert not torch.equal(first.ranges, other.ranges)
     both = (clean > 0) & (first.ranges > 0)
@@ -149,7 +150,7 @@ def compare_engines(mesh, positions):
 
 
 def test_both_engines_see_the_same_in_a_town():
-    street = places.street("town01")
+    street = places.town("town01")
     compare_engines(street.mesh, street.town.waypoints[[5, 900, 2000]] + np.float32([0, 0, 1.8]))
 
 
@@ -163,7 +164,7 @@ def test_both_engines_see_the_same_in_other_meshes(shared, name):
 def test_what_cannot_be_cast_is_named(yard):
     sensor = preset("paper-16x1024")
     for effects in (None, Effects(range_noise=0.1)):
-        with pytest.raises(ValueError, match="world is empty; it should be a mesh or several"):
-            simulate([], sensor, pose((0.0, 0.0, 1.8)), effects)
+        with pytest.raises(ValueError, match="world is empty; it should be one mesh or several"):
+            simulate.scan([], sensor, pose((0.0, 0.0, 1.8)), effects)
     with pytest.raises(ValueError, match="finite"):
-        simulate(yard, sensor, pose((math.nan, 0.0, 1.8)))
+        simulate.scan(yard, sensor, pose((math.nan, 0.0, 1.8)))
