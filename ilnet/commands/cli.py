@@ -28,7 +28,7 @@ class _Size(click.ParamType):
             self.fail(str(error), parameter, context)
 
 
-# The commands import what they need themselves, so that `--help` and a typing error answer at once.
+# Commands import what they need when they run, so that `--help` and a mistyped option answer at once.
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]}, invoke_without_command=True)
@@ -42,9 +42,9 @@ def cli(context: click.Context) -> None:
 @cli.command()
 @click.option("--mesh", type=Path, metavar="FILE", help="Scan this mesh (metres, z up) instead of the town.")
 @click.option("--at", type=(float, float, float), metavar="X Y Z", help="Position of the sensor in the mesh [m].")
-@click.option("--scan", type=Path, metavar="FILE", help="Decimate this scan, and judge against all of its rows.")
-@click.option("--rows", type=int, metavar="N", help="Beams of the scan to keep; 16 unless told.")
-@click.option("--sensor", metavar="NAME", help="Preset with the scan's angles, where the file does not name them.")
+@click.option("--scan", type=Path, metavar="FILE", help="Keep some beams of this scan; predict all.")
+@click.option("--rows", type=int, metavar="N", help="Beams of the scan to keep; 16 by default.")
+@click.option("--sensor", metavar="NAME", help="Preset with the scan's angles, if the file does not hold them.")
 @click.option("--out", type=Path, default=Path("demo_output"), show_default=True, help="Folder for the pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the table.")
 def demo(
@@ -86,9 +86,9 @@ def demo(
 @click.argument("model")
 @click.option("--preset", default="tiny", show_default=True, help="Size of the network and of its training.")
 @click.option("--steps", type=click.IntRange(min=1), help="Optimiser steps, instead of the preset's.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of weights and rays.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of weights and rays.")
 @click.option("--data", type=Path, metavar="DIR", help="Learn from stored images: an archive or a tree of .rimg files.")
-@click.option("--size", type=_Size(), help="Of the stored images to learn from; 128x2048 unless told.")
+@click.option("--size", type=_Size(), help="Size of the stored images; 128x2048 by default.")
 @click.option("--out", type=Path, default=Path("runs"), show_default=True, help="Folder for weights, figures, logs.")
 def train(
     model: str,
@@ -99,28 +99,39 @@ def train(
     size: tuple[int, int] | None,
     out: Path,
 ) -> None:
-    """Train MODEL on rays cast at continuous directions; goes on where an interrupted run in --out stopped.
+    """Train MODEL on rays at continuous directions; an interrupted run in --out goes on where it stopped.
 
     `torchrun --nproc-per-node N -m ilnet train MODEL` shares each batch among N processes or GPUs.
     """
     from ilnet.learning import train as training
-    from ilnet.sensor import PAPER_TARGET
+    from ilnet.sensor import PAPER_INPUT, PAPER_TARGET
 
     if size and not data:
         raise click.UsageError("--size goes with --data DIR")
+    if not data and training.learns_from_images(model, preset):
+        raise click.UsageError(
+            f"{model} with preset {preset} learns from stored images: make some with `python -m ilnet simulate "
+            f"--sizes {PAPER_INPUT.size},{PAPER_TARGET.size} --out DIR`, and name them with --data DIR"
+        )
     figures = training.train(model, preset, out, steps, seed, data, size or PAPER_TARGET.shape)
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
 
 
 @cli.command("evaluate")
-@click.option("--model", "names", multiple=True, required=True, metavar="NAME|FILE", help="May be given repeatedly.")
+@click.option(
+    "--model", "names", multiple=True, required=True, metavar="NAME|FILE", help="A model to measure; may be repeated."
+)
 @click.option("--scene", metavar="TOWN|MESH", help="Scan this town, or this mesh file (metres, z up).")
 @click.option("--at", type=Path, metavar="FILE", help='Positions in the mesh: {"positions": [[x, y, z], ...]} [m].')
-@click.option("--scan", type=Path, metavar="FILE", help="Decimate this scan, and judge against all of its rows.")
-@click.option("--rows", type=int, metavar="N", help="Beams of the scan to keep; 16 unless told.")
-@click.option("--sensor", metavar="NAME", help="Preset with the scan's angles, where the file does not name them.")
-@click.option("--size", type=_Size(), help="Rays to predict in the scene; 128x2048 unless told.")
-@click.option("--scans", type=click.IntRange(min=1), help="Scans of the scene; 8, or all positions, unless told.")
+@click.option("--scan", type=Path, metavar="FILE", help="Keep some beams of this scan; predict all.")
+@click.option("--rows", type=int, metavar="N", help="Beams of the scan to keep; 16 by default.")
+@click.option("--sensor", metavar="NAME", help="Preset with the scan's angles, if the file does not hold them.")
+@click.option("--size", type=_Size(), help="Rays to predict in the scene; 128x2048 by default.")
+@click.option(
+    "--scans",
+    type=click.IntRange(min=1),
+    help="Scans of the scene; by default 8 of a town, or all positions in a mesh.",
+)
 @click.option(
     "--json", "as_json", is_flag=True, help="Print an object instead of the table, or a list for many models."
 )
@@ -176,13 +187,16 @@ def evaluate_(
 @cli.command("upsample")
 @click.argument("source", metavar="IN", type=Path)
 @click.argument("out", metavar="OUT", type=Path)
-@click.option("--size", type=_Size(), help="Rays wanted over the same field of view.")
-@click.option("--sensor", metavar="NAME", help="Or the preset whose scan is wanted.")
+@click.option("--size", type=_Size(), help="Rays to predict, over the same field of view.")
+@click.option("--sensor", metavar="NAME", help="Preset to predict, instead of --size.")
 @click.option("--model", "name", default="iln-prior", show_default=True, metavar="NAME|FILE")
+@click.option("--from", "origin", metavar="NAME", help="Preset with the angles of IN, if its files do not hold them.")
 @click.option(
-    "--from", "origin", metavar="NAME", help="Preset with the angles of IN, where its files do not name them."
+    "--format",
+    "suffix",
+    type=click.Choice(["npz", "ply", "pcd"]),
+    help="Format of the files in a folder OUT; npz by default.",
 )
-@click.option("--format", "suffix", type=click.Choice(["npz", "ply", "pcd"]), help="In a folder OUT; npz unless told.")
 @click.pass_context
 def upsample_(
     context: click.Context,
@@ -214,16 +228,31 @@ def upsample_(
 
 
 @cli.command()
-@click.option("--towns", metavar="NAMES", help="Towns, comma separated, with a seed as in town01:7; all unless told.")
+@click.option(
+    "--towns", metavar="NAMES", help="Towns, comma separated, a seed after a colon: town01:7. All by default."
+)
 @click.option("--mesh", type=Path, metavar="FILE", help="Scan this mesh (metres, z up) instead of towns.")
 @click.option("--at", type=Path, metavar="JSON", help='Sensor positions in the mesh [m]: {"positions": [[x, y, z]]}.')
-@click.option("--scans", type=click.IntRange(min=1), required=True, metavar="N", help="Poses to scan from, in all.")
-@click.option("--sizes", metavar="HxW", help=f"Of the paper's sensor, comma separated; {_SIZES} unless told.")
+@click.option("--scans", type=click.IntRange(min=1), required=True, metavar="N", help="Poses to scan from, in total.")
+@click.option("--sizes", metavar="HxW", help=f"Sizes of the paper's sensor, comma separated; {_SIZES} by default.")
 @click.option("--sensor", metavar="NAMES", help="Presets, comma separated, instead of --sizes.")
-@click.option("--effect", "effects", multiple=True, metavar="NAME=VALUE", help="Such as range_noise=0.02.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of waypoints, poses, traffic.")
-@click.option("--shard", metavar="I/N", default="1/1", help="Do part I of N, for many hosts; merge by copying files.")
-@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes on a CPU; all cores unless told.")
+@click.option(
+    "--effect",
+    "effects",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="An effect, such as range_noise=0.02; may be repeated.",
+)
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of waypoints, poses and traffic."
+)
+@click.option(
+    "--shard",
+    metavar="I/N",
+    default="1/1",
+    help="Simulate part I of N, on several hosts; merge the parts by copying files.",
+)
+@click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes on a CPU; one per core by default.")
 @click.option("--out", type=Path, required=True, help="Folder of the archive; an interrupted run goes on there.")
 def simulate(
     towns: str | None,
@@ -238,7 +267,7 @@ def simulate(
     workers: int | None,
     out: Path,
 ) -> None:
-    """Simulate scans into a Zarr archive; killed at any moment, the same command goes on."""
+    """Simulate scans into a Zarr archive; if it is interrupted, the same command goes on."""
     if bool(mesh) != bool(at):
         raise click.UsageError("--mesh FILE and --at JSON go together")
     if mesh and towns:
@@ -262,10 +291,10 @@ def simulate(
     try:
         archive = generate.generate(out, places, scans, sensors, seed, (int(part), int(parts)), workers, wanted)
     except KeyboardInterrupt:
-        click.echo(f"interrupted: what is complete stays in {out}; the same command goes on from there", err=True)
+        click.echo(f"interrupted: finished units stay in {out}; the same command goes on from there", err=True)
         raise
     left = len(archive.missing())
-    state = f"{left} units of {generate.UNIT} scans are left to other shards" if left else "complete"
+    state = f"{left} units of {generate.UNIT} scans are left for other shards" if left else "complete"
     click.echo(f"{out}: {scans} scans of {', '.join(archive.sizes)}: {state}")
 
 
@@ -273,7 +302,7 @@ def simulate(
 @click.argument("sections", nargs=-1, type=click.Choice(["ops", "frame", "train", "rays"]))
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON list instead of the table.")
 def bench(sections: tuple[str, ...], as_json: bool) -> None:
-    """Time our ops, frames, training steps and rays beside what one would otherwise write; all unless told."""
+    """Time our ops, frames, training steps and rays beside the usual ways to write them; by default all of them."""
     from ilnet.commands import bench as benchmarks
 
     rows = benchmarks.bench(sections)
@@ -282,11 +311,18 @@ def bench(sections: tuple[str, ...], as_json: bool) -> None:
 
 @cli.command()
 @click.option(
-    "--scan", "scans", type=Path, multiple=True, metavar="FILE", help="A measured scan that names its angles."
+    "--scan",
+    "scans",
+    type=Path,
+    multiple=True,
+    metavar="FILE",
+    help="A measured scan that holds its angles; may be repeated.",
 )
-@click.option("--mesh", "meshes", type=Path, multiple=True, metavar="FILE", help="A mesh (metres, z up).")
+@click.option(
+    "--mesh", "meshes", type=Path, multiple=True, metavar="FILE", help="A mesh (metres, z up); may be repeated."
+)
 @click.option("--at", type=Path, multiple=True, metavar="JSON", help="Positions in the mesh: one file for each --mesh.")
-@click.option("--town", "towns", multiple=True, metavar="NAME", help="A town, or `all` of them.")
+@click.option("--town", "towns", multiple=True, metavar="NAME", help="A town, or `all`; may be repeated.")
 @click.option("--out", type=Path, default=Path("survey_output"), show_default=True, help="Folder for the figure.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON list instead of the table.")
 def survey(
@@ -315,9 +351,7 @@ def survey(
 
 
 @cli.command()
-@click.option(
-    "--town", "names", multiple=True, metavar="NAME", help="Draw this town; may be repeated. All unless told."
-)
+@click.option("--town", "names", multiple=True, metavar="NAME", help="A town to draw; may be repeated. All by default.")
 @click.option("--out", type=Path, default=Path("towns_output"), show_default=True, help="Folder for the pictures.")
 def towns(names: tuple[str, ...], out: Path) -> None:
     """Draw the procedural towns: from above, from the street, and one scan of each."""
@@ -333,12 +367,22 @@ def towns(names: tuple[str, ...], out: Path) -> None:
     "names", nargs=-1, type=click.Choice(["table", "convergence", "attention", "prior", "rays", "real", "all"])
 )
 @click.option(
-    "--preset", help="Of each training; small unless told, and table and real then take the networks that ship."
+    "--preset", help="Preset of each training. By default small, and table and real use the networks that ship."
 )
-@click.option("--out", type=Path, default=Path("runs/experiments"), show_default=True, help="Folder for all there is.")
-@click.option("--scans", type=click.IntRange(min=1), default=20, show_default=True, help="From each test town.")
-@click.option("--seeds", type=click.IntRange(min=1), default=3, show_default=True, help="Trainings behind each band.")
-@click.option("--data", type=Path, metavar="DIR", help="Stored images: for LiDAR-SR, and against continuous rays.")
+@click.option(
+    "--out",
+    type=Path,
+    default=Path("runs/experiments"),
+    show_default=True,
+    help="Folder for weights, numbers and figures.",
+)
+@click.option("--scans", type=click.IntRange(min=1), default=20, show_default=True, help="Scans from each test town.")
+@click.option(
+    "--seeds", type=click.IntRange(min=1), default=3, show_default=True, help="Trainings for each band of a curve."
+)
+@click.option(
+    "--data", type=Path, metavar="DIR", help="Stored images: for LiDAR-SR, and to compare with continuous rays."
+)
 @click.option("--measured", type=Path, multiple=True, metavar="FILE", help="A measured scan; may be repeated.")
 def experiment(
     names: tuple[str, ...],
@@ -349,7 +393,7 @@ def experiment(
     data: Path | None,
     measured: tuple[Path, ...],
 ) -> None:
-    """Run the paper's experiments and ours: CSV, figures, RESULTS.md. Goes on where it was interrupted."""
+    """Run the paper's experiments and ours: CSV, figures, RESULTS.md. An interrupted run goes on where it stopped."""
     if not names:
         raise click.UsageError("name some experiments, or all")
     from ilnet.commands import experiment as experiments
@@ -381,8 +425,8 @@ def _table(methods: dict[str, dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Runs the command line; what a user can mend is one line on stderr and exit code 2."""
-    # Torch's threads would stay awake for milliseconds after each operation, on cores that the next kernel wants.
+    """Runs the command line; an error that a user can fix is one line on stderr and exit code 2."""
+    # By default torch's threads stay awake for milliseconds after each operation, on cores that the next kernel needs.
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")
     try:
         sys.exit(cli.main(prog_name="python -m ilnet", standalone_mode=False))

@@ -1,6 +1,6 @@
 """Training with Lightning: L1 on normalised ranges (paper, Sec. III-B).
 
-What is learned from are rays cast at continuous directions while training goes on, or, as in the paper, the pixels of
+A network learns from rays that are cast at continuous directions while it trains or, as in the paper, from pixels of
 images stored on disk. Under `torchrun` several processes share each batch.
 """
 
@@ -27,19 +27,20 @@ from ilnet.scan import Pair
 from ilnet.sensor import PAPER_INPUT, PAPER_TARGET, format_size, preset
 from ilnet.world import places, simulate, towns
 
-__all__ = ["PRESETS", "Preset", "Training", "train"]
+__all__ = ["PRESETS", "Preset", "Training", "learns_from_images", "train"]
 
-# What the best weights predict best.
+# The sensor whose scans a training predicts when it is validated.
 VALIDATION = preset("paper-64x1024")
-# What the best weights are chosen by: scans of towns that no training sees. (Seed 0, the default, is that of training.)
+# The best weights are chosen on scans of these towns, by seed. No training sees them: trainings use seed 0.
 HELD_OUT = {"town01": 1, "town03": 1, "town05": 1}
 HELD_OUT_SCANS = 4
 PRECISION: Any = "bf16-mixed"
-# Validations in a training, and the fewest and most steps between them.
+# How many validations a training has, and the fewest and the most steps between them.
 VALIDATIONS = 20
 VALIDATE_EVERY = 50, 2000
-# Steps.
+# Steps between checkpoints, and between readings of the loss.
 CHECKPOINT_EVERY = 100
+READ_EVERY = 10
 
 
 @dataclass(frozen=True)
@@ -47,29 +48,29 @@ class Preset:
     """The size of a network and of its training."""
 
     steps: int = 0
-    """Optimiser steps; 0 where `epochs` tells them."""
+    """Optimiser steps; 0 if `epochs` decides."""
     epochs: int = 0
-    """How often each stored scan is seen; 0 where `steps` tells it."""
+    """How often each stored scan is seen; 0 if `steps` decides."""
     halve_after: tuple[int, ...] = ()
-    """Epochs after which the learning rate is halved. Where empty, it rises over the first steps and falls to 0 as a
-    cosine."""
+    """Epochs after which the learning rate is halved. If empty, the rate rises over the first steps and falls to 0 as
+    a cosine."""
     rate: float = 1e-3
     """Highest learning rate."""
     blocks: int = 16
     """Residual blocks of the encoder."""
     crops: int = 8
-    """Crops in a step."""
+    """Crops per step."""
     columns: int = 64
-    """Columns of a crop."""
+    """Columns per crop."""
     queries: int = 1024
     """Rays per crop."""
     dropout: float = 0.0
-    """In the attention blocks."""
+    """Dropout rate in the attention blocks."""
     towns: tuple[str, ...] = towns.TRAIN
-    """Where continuous rays are cast."""
+    """Towns in which continuous rays are cast."""
 
     def arguments(self, name: str) -> dict[str, Any]:
-        """What differs from the own defaults of the model called `name`."""
+        """Returns the preset's arguments for the model called `name`."""
         own: dict[str, dict[str, Any]] = {"liif": {"blocks": self.blocks}, "lidar-sr": {}}
         return own.get(name, {"blocks": self.blocks, "dropout": self.dropout})
 
@@ -79,8 +80,8 @@ PRESETS = {
     "paper": Preset(
         epochs=1000, halve_after=(200, 400, 600, 800), rate=1e-4, crops=16, columns=1024, queries=16_384, dropout=0.1
     ),
-    # Full-size networks: an hour and a half, and ten minutes, on two cores; LIIF takes half as long again. Many small
-    # steps get further in that time than few large ones.
+    # Networks of full size. On two cores `laptop` takes an hour and a half and `small` ten minutes; LIIF takes half as
+    # long again. In that time many small steps get further than few large ones.
     "laptop": Preset(steps=20_000),
     "small": Preset(steps=2000),
     # A minute or two, for the course.
@@ -92,12 +93,12 @@ class Training(lightning.LightningModule):
     """One network, its loss, its schedule and its validation.
 
     Args:
-        model: What is trained; it has a `norm_range`.
+        model: The model to train; its `norm_range` is above 0.
         held_out: Pairs of an input scan and the scan to be predicted.
-        probe: More such pairs, whose figures are logged and decide nothing.
         rate: Highest learning rate.
-        halve_after: Steps after which the rate is halved; where empty, it follows one cycle.
+        halve_after: Steps after which the rate is halved; if empty, it follows one cycle.
         run: What tells this run from others; kept in its checkpoints.
+        probe: More such pairs; their figures are logged and decide nothing.
     """
 
     def __init__(
@@ -116,26 +117,22 @@ class Training(lightning.LightningModule):
         self.begun = time.monotonic()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Lets `train` refuse to go on with a run of another kind, and count its time."""
+        """Adds what `train` needs to refuse a run of another kind, and the time spent."""
         checkpoint["run"], checkpoint["seconds"] = self.run, time.monotonic() - self.begun
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Counts the time of the run that goes on."""
+        """Goes on counting from the time spent before the interruption."""
         self.begun = time.monotonic() - checkpoint["seconds"]
 
     def training_step(self, batch: data.Batch, index: int) -> torch.Tensor:
-        """L1 between ranges scaled to [-1, 1]."""
+        """Returns the L1 loss of ranges scaled to [-1, 1]."""
         predicted = self.model(batch.image, batch.queries, wrap=batch.wrap)
         loss = (predicted - batch.ranges).abs().mean() * (2 / self.model.norm_range)
-        if not loss.isfinite():
-            file = Path(self.trainer.default_root_dir) / f"step-{self.global_step}.pt"
-            torch.save({"batch": batch._asdict(), "model": self.model.state_dict()}, file)
-            raise ValueError(f"the loss of step {self.global_step} is {loss}; its batch and the weights are in {file}")
         self.log("loss", loss, prog_bar=True)
         return loss
 
     def validation_step(self, place: tuple[str, int], index: int) -> None:
-        """Measures one scan: of which kind, and its number."""
+        """Measures the prediction of one scan, given its kind ("val" or "test") and number."""
         kind, number = place
         scan, truth = self.pairs[kind][number]
         with torch.autocast(self.device.type, enabled=False):  # as `evaluate` measures
@@ -143,7 +140,7 @@ class Training(lightning.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Logs the means over all scans of all processes."""
-        training = self.trainer.state.fn == "fit"  # and not the last word on the weights that were chosen
+        training = self.trainer.state.fn == "fit"  # the figures of the chosen weights are returned, not logged
         self.log("seconds", time.monotonic() - self.begun, logger=training)
         for kind, figures in self.figures.items():
             for name, value in figures.compute().items():  # type: ignore[operator]
@@ -152,9 +149,9 @@ class Training(lightning.LightningModule):
             figures.reset()  # type: ignore[operator]
 
     def configure_optimizers(self) -> Any:
-        """Adam; the rate warms up and decays to 0, or is halved now and then."""
-        # While the head of a network with a prior is next to zero, so are the gradients of its encoder: Adam would blow
-        # up their noise, and the features with it, were its eps not above them.
+        """Returns Adam, with a rate that warms up and decays to 0, or is halved after some steps."""
+        # The head of a network with a prior starts at zero, and with it the gradients of the encoder. A smaller eps
+        # would let Adam scale up their noise.
         optimizer = torch.optim.Adam(self.parameters(), lr=self.rate, eps=1e-6)
         steps = int(self.trainer.estimated_stepping_batches)
         schedule: torch.optim.lr_scheduler.LRScheduler
@@ -176,64 +173,104 @@ def train(
     probe: Sequence[Pair] = (),
     **arguments: Any,
 ) -> dict[str, float]:
-    """Trains a model and writes its weights and figures; goes on where an interrupted run in `out` stopped.
+    """Trains a model and writes its weights and figures; an interrupted run in `out` goes on where it stopped.
 
-    Started by `torchrun`, all its processes share each batch, and the result is that of one process but for rounding.
+    Under `torchrun` all processes share each batch. The result is that of one process but for rounding.
 
     Args:
         name: One of `models.TRAINABLE`.
         preset_name: One of `PRESETS`.
-        out: Folder for `NAME.safetensors`, and below `NAME/` the checkpoints of an unfinished run and the logs of each
-            start, `from-step-N/` with metrics.csv and what TensorBoard reads.
-        steps: Overrides the preset's.
-        seed: Of the initial weights and the rays, 0 or more.
-        archive: Stored images to learn from instead of continuous rays; see `data.open_archive`. LiDAR-SR has no other
-            way to learn.
-        target: Size (rows, columns) of the stored images to learn from; the one that LiDAR-SR predicts, of which it
-            learns all pixels in sectors of scans.
-        probe: Pairs of an input scan and the scan to be predicted, whose figures are logged as `test/...` and decide
+        out: Folder for `NAME.safetensors`. Its folder `NAME/` holds the checkpoints of an unfinished run, and for each
+            start a folder `from-step-N/` with metrics.csv and the logs that TensorBoard reads.
+        steps: Optimiser steps, instead of the preset's.
+        seed: Seed of the initial weights and of the rays, 0 or more.
+        archive: Stored images to learn from instead of continuous rays; see `data.open_archive`. LiDAR-SR needs them.
+        target: Size (rows, columns) of the stored images to learn from. LiDAR-SR predicts images of this size, and
+            learns all of their pixels, in sectors of scans.
+        probe: Pairs of an input scan and the scan to be predicted. Their figures are logged as `test/...` and decide
             nothing.
-        **arguments: Override the model's.
+        **arguments: Arguments of the model; they override the preset's.
 
     Returns:
-        The figures on held-out scans of the weights that were best there.
+        The figures on held-out scans, with the weights that were best there.
 
     Raises:
         ValueError: If there is no such model or preset, images are missing or of a size that does not fit, `out` holds
-            an interrupted run of another kind, or the loss is not a number.
+            an interrupted run of another kind, a process has no GPU of its own, or a loss is not finite.
     """
+    plan = _plan(name, preset_name, steps, seed, archive, target, arguments)
+    start = _steps_done(out / name / "last.ckpt", plan.run)
+    training, batches, scans = _build(plan, start, probe)
+    return _run(plan, training, batches, scans, out, start)
+
+
+def learns_from_images(name: str, preset_name: str) -> bool:
+    """Returns whether a model with a preset can learn from stored images only."""
+    return name == "lidar-sr" or (preset_name in PRESETS and PRESETS[preset_name].epochs > 0)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What a training does, its arguments checked."""
+
+    name: str
+    size: Preset
+    arguments: dict[str, Any]
+    """Of the model."""
+    steps: int
+    seed: int
+    stored: data.Archive | data.RangeImageTree | None
+    """Where None, it learns from continuous rays."""
+    per_epoch: int
+    """Steps in which each stored scan is seen once."""
+    target: tuple[int, int]
+    run: dict[str, Any]
+    """What tells this run from others; kept in its checkpoints and beside its weights."""
+
+
+def _plan(
+    name: str,
+    preset_name: str,
+    steps: int | None,
+    seed: int,
+    archive: Path | None,
+    target: tuple[int, int],
+    arguments: dict[str, Any],
+) -> _Plan:
+    """Checks the arguments of `train` and completes them from the preset."""
     if preset_name not in PRESETS:
         raise ValueError(f"unknown preset {preset_name!r}; known are {', '.join(PRESETS)}")
     if name not in models.TRAINABLE:
         raise ValueError(f"model {name!r} cannot be trained; these can: {', '.join(models.TRAINABLE)}")
-    size = PRESETS[preset_name]
-    source = PAPER_INPUT.shape
-    if archive is None and (size.epochs or name == "lidar-sr"):
+    size, source = PRESETS[preset_name], PAPER_INPUT.shape
+    given, wanted = format_size(source), format_size(target)
+    if archive is None and learns_from_images(name, preset_name):
         raise ValueError(
-            f"{name} with preset {preset_name} learns from stored images: make some with `python -m ilnet simulate "
-            f"--sizes {format_size(source)},{format_size(target)} --out DIR`, and name them with --data DIR"
+            f"archive is None; it should be a folder of stored images of {given} and {wanted}, from which {name} with "
+            f"preset {preset_name} learns: see `ilnet.data.generate`"
         )
     if name == "lidar-sr":
         if target[0] % source[0] or target[1] % source[1]:
-            raise ValueError(
-                f"size is {format_size(target)}; for lidar-sr it should be a multiple of {format_size(source)}"
-            )
+            raise ValueError(f"target is {wanted}; for lidar-sr it should be a multiple of {given}")
         arguments = {"rows": target[0] // source[0], "columns": target[1] // source[1], **arguments}
     stored = None if archive is None else data.open_archive(archive)
     per_epoch = -(-len(stored) // size.crops) if stored else 0
     steps = steps or size.steps or size.epochs * per_epoch
     arguments = {**size.arguments(name), **arguments}
-    learns_from = f"{format_size(target)} of {archive}" if archive else "continuous rays"
+    learns_from = f"{wanted} of {archive}" if archive else "continuous rays"
     run = {"preset": preset_name, "steps": steps, "seed": seed, "data": learns_from, **arguments}
-    folder = out / name
-    start = _steps_done(folder / "last.ckpt", run)
+    return _Plan(name, size, arguments, steps, seed, stored, per_epoch, target, run)
 
-    device = simulate.best_device()
-    number, processes = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
-    lightning.seed_everything(seed, verbose=False)
-    model = models.create(name, **arguments)
-    samples = _samples(name, size, stored, target, seed, start, (number, processes), device)
-    output = PAPER_INPUT.resize(*target) if name == "lidar-sr" else VALIDATION
+
+def _build(
+    plan: _Plan, start: int, probe: Sequence[Pair]
+) -> tuple[Training, DataLoader[data.Batch], DataLoader[tuple[str, int]]]:
+    """Returns the training, its batches from step `start` on, and the numbers of the scans that validate it."""
+    device, part = _device(), (int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1)))
+    lightning.seed_everything(plan.seed, verbose=False)
+    model = models.create(plan.name, **plan.arguments)
+    samples = _samples(plan, start, part, device)
+    output = PAPER_INPUT.resize(*plan.target) if plan.name == "lidar-sr" else VALIDATION
     held_out: list[Pair] = [
         (pair[0], pair[1])
         for town, held_out_seed in HELD_OUT.items()
@@ -241,28 +278,41 @@ def train(
             places.town(town, held_out_seed, device), HELD_OUT_SCANS, [PAPER_INPUT, output]
         )
     ]
-    training = Training(model, held_out, size.rate, [epoch * per_epoch for epoch in size.halve_after], run, probe)
-    numbered = [
-        (kind, place) for kind, pairs in training.pairs.items() for place in range(number, len(pairs), processes)
-    ]
+    halve_after = [epoch * plan.per_epoch for epoch in plan.size.halve_after]
+    training = Training(model, held_out, plan.size.rate, halve_after, plan.run, probe)
+    number, processes = part
+    numbered = [(kind, i) for kind, pairs in training.pairs.items() for i in range(number, len(pairs), processes)]
     scans: DataLoader[tuple[str, int]] = DataLoader(numbered, batch_size=None)  # type: ignore[arg-type]
+    return training, DataLoader(samples, batch_size=None, **_workers(device)), scans
+
+
+def _run(
+    plan: _Plan,
+    training: Training,
+    batches: DataLoader[data.Batch],
+    scans: DataLoader[tuple[str, int]],
+    out: Path,
+    start: int,
+) -> dict[str, float]:
+    """Trains, chooses the best weights, writes them to `out` and returns their figures."""
+    folder, steps = out / plan.name, plan.steps
     best = ModelCheckpoint(folder, "best", monitor="val/iou", mode="max", enable_version_counter=False)
+    last = folder / "last.ckpt"
     trainer = lightning.Trainer(
         max_steps=steps,
         precision=PRECISION,
-        accelerator=device.type,
-        **_processes(processes),
+        accelerator=simulate.best_device().type,
+        **_processes(int(os.environ.get("WORLD_SIZE", 1))),
         use_distributed_sampler=False,
         val_check_interval=min(max(VALIDATE_EVERY[0], steps // VALIDATIONS), VALIDATE_EVERY[1], steps),
         num_sanity_val_steps=0,
-        log_every_n_steps=10,
+        log_every_n_steps=READ_EVERY,
         default_root_dir=folder,
-        logger=[kind(out, name=name, version=f"from-step-{start}") for kind in (CSVLogger, TensorBoardLogger)],
-        callbacks=[best, _Last(folder / "last.ckpt"), TQDMProgressBar()],
+        logger=[kind(out, name=plan.name, version=f"from-step-{start}") for kind in (CSVLogger, TensorBoardLogger)],
+        callbacks=[_Watch(folder), best, _Last(last), TQDMProgressBar(refresh_rate=READ_EVERY)],
         enable_model_summary=False,
     )
-    batches = DataLoader(samples, batch_size=None, **_workers(device))
-    trainer.fit(training, batches, scans, ckpt_path=folder / "last.ckpt" if start else None)
+    trainer.fit(training, batches, scans, ckpt_path=last if start else None)
     if trainer.interrupted:
         raise KeyboardInterrupt
     figures = _validate(trainer, training, scans)
@@ -271,17 +321,76 @@ def train(
         training.load_state_dict(state["state_dict"])
         figures = _validate(trainer, training, scans)
     if trainer.is_global_zero:
-        models.save(model, out / f"{name}.safetensors", name, arguments, **run, held_out=figures)
-        for file in folder.glob("*.ckpt"):
-            file.unlink()
+        file = out / f"{plan.name}.safetensors"
+        models.save(training.model, file, plan.name, plan.arguments, **plan.run, held_out=figures)
+        for checkpoint in folder.glob("*.ckpt"):
+            checkpoint.unlink()
     return figures
 
 
-class _Last(Checkpoint):
-    """Keeps what an interrupted run goes on from: every so many steps, and after each validation.
+class _Watch(lightning.Callback):
+    """Stops all processes together when a loss is not finite, and keeps what shows why.
 
-    Never between a step and its validation, which the run that goes on would leave out. Being a `Checkpoint`, it is
-    called behind the one that keeps the best, and so remembers how good that was.
+    The losses of several steps are read at once: a GPU has to wait whenever the host reads one. They are read before
+    each validation and each checkpoint as well, so that neither sees spoilt weights.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.unread: list[tuple[torch.Tensor, data.Batch]] = []
+        self.weights: dict[str, torch.Tensor] = {}
+
+    def on_train_start(self, trainer: lightning.Trainer, training: lightning.LightningModule) -> None:
+        self._remember(training)
+
+    def on_train_batch_end(
+        self, trainer: lightning.Trainer, training: lightning.LightningModule, outputs: Any, batch: Any, index: int
+    ) -> None:
+        self.unread.append((outputs["loss"], batch))
+        if len(self.unread) == READ_EVERY:
+            self._read(trainer, training)
+
+    def on_validation_start(self, trainer: lightning.Trainer, training: lightning.LightningModule) -> None:
+        self._read(trainer, training)
+
+    def on_save_checkpoint(
+        self, trainer: lightning.Trainer, training: lightning.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        self._read(trainer, training)
+
+    def _remember(self, training: lightning.LightningModule) -> None:
+        self.weights = {name: weight.clone() for name, weight in training.get_submodule("model").state_dict().items()}
+
+    def _read(self, trainer: lightning.Trainer, training: lightning.LightningModule) -> None:
+        if not self.unread:
+            return
+        losses, count = torch.stack([loss for loss, _ in self.unread]), len(self.unread)
+        first = torch.arange(count, device=losses.device).where(~losses.isfinite(), count).min()
+        if torch.distributed.is_initialized():
+            torch.distributed.all_reduce(first, torch.distributed.ReduceOp.MIN)
+        if (number := int(first)) == count:
+            self.unread.clear()
+            self._remember(training)
+            return
+        start = trainer.global_step - count
+        (loss, batch), step = self.unread[number], start + number
+        if loss.isfinite():
+            raise ValueError(f"the loss of step {step} is not finite in another process")
+        process = f"-process-{trainer.global_rank}" if trainer.world_size > 1 else ""
+        file = self.folder / f"step-{step}{process}.pt"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        torch.save({"batch": batch._asdict(), "model": self.weights}, file)
+        raise ValueError(
+            f"the loss of step {step} is {loss:g}; it should be finite: "
+            f"{file} holds the batch, and the weights of step {start}"
+        )
+
+
+class _Last(Checkpoint):
+    """Writes the checkpoint from which an interrupted run goes on: every so many steps, and after each validation.
+
+    It never writes between a step and its validation: the run that goes on would leave the validation out. Lightning
+    calls it after the `ModelCheckpoint` before it, so that the file holds the best score so far.
     """
 
     def __init__(self, file: Path):
@@ -298,43 +407,48 @@ class _Last(Checkpoint):
 
 
 def _samples(
-    name: str,
-    size: Preset,
-    stored: data.Archive | data.RangeImageTree | None,
-    target: tuple[int, int],
-    seed: int,
-    start: int,
-    part: tuple[int, int],
-    device: torch.device,
+    plan: _Plan, start: int, part: tuple[int, int], device: torch.device
 ) -> data.ContinuousRays | data.StoredImages:
-    if stored is None:
+    size, target, source = plan.size, plan.target, PAPER_INPUT
+    if plan.stored is None:
         streets = [places.town(town, 0, device) for town in size.towns]
-        return data.ContinuousRays(streets, PAPER_INPUT, size.crops, size.columns, size.queries, seed, start, part)
-    source = PAPER_INPUT.shape
-    if name == "lidar-sr":
-        # It learns from all that it predicts: of as many scans, since its batch norm fails with one, but half as wide.
-        scans, sector = size.crops, source[1] if size.epochs else size.columns // 2
-        queries = math.prod(target) * sector // source[1]
+        return data.ContinuousRays(streets, source, size.crops, size.columns, size.queries, plan.seed, start, part)
+    columns = source.shape[1]
+    if plan.name == "lidar-sr":
+        # It learns all pixels that it predicts. Batch norm needs several scans, so it sees only a sector of each.
+        scans, sector = size.crops, columns if size.epochs else size.columns // 2
+        queries = math.prod(target) * sector // columns
     else:  # as many columns and as many queries as the crops have, in whole scans
-        scans, sector = max(1, size.crops * size.columns // source[1]), None
+        scans, sector = max(1, size.crops * size.columns // columns), None
         queries = size.crops * size.queries // scans
-    return data.StoredImages(
-        stored, format_size(source), format_size(target), scans, queries, seed, start, part, sector
-    )
+    sizes = source.size, format_size(target)
+    return data.StoredImages(plan.stored, *sizes, scans, queries, plan.seed, start, part, sector)
+
+
+def _device() -> torch.device:
+    """Returns the device of this process: `torchrun` numbers the processes of a machine, and each has its own GPU."""
+    device = simulate.best_device()
+    if device.type != "cuda":
+        return device
+    number, gpus = int(os.environ.get("LOCAL_RANK", 0)), torch.cuda.device_count()
+    if number >= gpus:
+        raise ValueError(f"LOCAL_RANK is {number}; it should be below {gpus}: start one process for each GPU")
+    torch.cuda.set_device(number)
+    return torch.device("cuda", number)
 
 
 def _workers(device: torch.device) -> dict[str, Any]:
-    """Who makes batches: a process beside the training, where there are cores to spare for it."""
-    # On two cores it takes more than it gives: a batch is drawn in a sixth of the time of a step.
+    """Returns arguments for a `DataLoader`: a worker process makes the batches if there are cores to spare."""
+    # On two cores a worker costs more than it saves: drawing a batch takes a sixth of the time of a step.
     spare = device.type == "cpu" and torch.get_num_threads() > 2 and "fork" in multiprocessing.get_all_start_methods()
     return {"num_workers": 1, "multiprocessing_context": "fork"} if spare else {}
 
 
 def _processes(number: int) -> dict[str, Any]:
-    """How Lightning is told of the processes that `torchrun` started."""
+    """Returns the arguments that tell Lightning of the processes that `torchrun` started."""
     if number == 1:
         return {"devices": 1}
-    # Lightning leaves a group of CPU processes open, whose threads now and then abort the interpreter on its way out.
+    # Lightning leaves the group of CPU processes open. Its threads sometimes abort the interpreter at exit.
     atexit.unregister(_close_group)
     atexit.register(_close_group)
     here = int(os.environ["LOCAL_WORLD_SIZE"])
@@ -353,13 +467,13 @@ def _validate(trainer: lightning.Trainer, training: Training, scans: DataLoader[
 
 
 def _steps_done(checkpoint: Path, run: dict[str, Any]) -> int:
-    """How far the interrupted run behind a checkpoint came; 0 where there is none. ValueError if it is not `run`."""
+    """Returns the steps of the interrupted run in a checkpoint, 0 if there is none; ValueError if it is not `run`."""
     if not checkpoint.exists():
         return 0
     state = torch.load(checkpoint, weights_only=True, map_location="cpu")
     if state["run"] != run:
         raise ValueError(
             f"{checkpoint} is an interrupted run of {state['run']}, not of {run}: "
-            "go on with that one, delete the file, or choose another --out"
+            "continue that one, delete the file, or choose another folder"
         )
     return state["global_step"]

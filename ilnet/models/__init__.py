@@ -1,4 +1,4 @@
-"""The models by name, made untrained or loaded from a file of weights."""
+"""The models by name: made untrained, or loaded from a file of weights."""
 
 import json
 from pathlib import Path
@@ -33,7 +33,7 @@ __all__ = [
     "save",
 ]
 
-# What `iln-prior` adds to the paper's network was chosen on scans held out of the training towns.
+# The prior and the snap of `iln-prior` were chosen on held-out scans of the training towns.
 _MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
     "nearest": (Nearest, {}),
     "bilinear": (Bilinear, {}),
@@ -51,11 +51,11 @@ _SHIPPED = Path(__file__).parents[1] / "weights"
 
 
 def create(name: str, **arguments: Any) -> Model:
-    """Makes an untrained model.
+    """Returns an untrained model.
 
     Args:
         name: One of `NAMES`.
-        **arguments: The constructor's; they override what the name stands for.
+        **arguments: Arguments of the constructor; they override those that the name stands for.
 
     Raises:
         ValueError: If there is no such model.
@@ -67,14 +67,19 @@ def create(name: str, **arguments: Any) -> Model:
 
 
 def save(model: Model, path: str | Path, name: str, arguments: dict[str, Any], **card: Any) -> None:
-    """Writes weights in half precision, which no figure shows, with all that is needed to make the model again.
+    """Writes weights, with all that is needed to make the model again.
+
+    They are stored in half precision, which changes no figure of the project.
 
     Args:
-        model: Whose weights are written.
-        path: A `.safetensors` file; its folder is made.
+        model: The model whose weights are written.
+        path: A `.safetensors` file; its folder is made if it is missing.
         name: One of `NAMES`.
-        arguments: The constructor's arguments besides what the name stands for today, which is written as well.
-        **card: How it was trained; JSON values.
+        arguments: Arguments of the constructor beyond those that the name stands for today. Both are written.
+        **card: How the model was trained; JSON values.
+
+    Raises:
+        OSError: If the file cannot be written.
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     about = {"name": name, "arguments": {**_MODELS[name][1], **arguments}, **card}
@@ -87,21 +92,21 @@ def save(model: Model, path: str | Path, name: str, arguments: dict[str, Any], *
 
 
 def load(name: str | Path) -> Model:
-    """Loads a trained model, ready to predict.
+    """Returns a trained model on the CPU, ready to predict; `model.to(device)` moves it to where the scans are.
 
     Args:
-        name: One of `NAMES`, for the weights that ship with the package, a `.safetensors` file that `save` wrote, or a
-            `.pth` checkpoint of the authors' ILN, LIIF or LiDAR-SR. Nothing in a file is ever executed.
+        name: One of `NAMES`, for the weights that ship with the package; or a `.safetensors` file that `save` wrote; or
+            a `.pth` checkpoint of the authors' ILN, LIIF or LiDAR-SR. Nothing in a file is ever executed.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        ValueError: If it is neither a name nor a file of weights.
+        FileNotFoundError: If there is no such file, or no weights ship for that name.
+        ValueError: If `name` is neither a name nor a file of weights.
     """
     if name in NAMES and name not in TRAINABLE:
         return create(str(name)).eval()
     path = _SHIPPED / f"{name}.safetensors" if name in NAMES else Path(name)
     if name in NAMES and not path.is_file():
-        raise FileNotFoundError(f"no weights ship for {name}; train them: python -m ilnet train {name}")
+        raise FileNotFoundError(f"no weights ship for {name}; train them: `python -m ilnet train {name}`")
     if path.suffix not in (".safetensors", ".pth"):
         raise ValueError(
             f"unknown model {str(name)!r}; known are {', '.join(NAMES)}, a .safetensors file, "
@@ -122,19 +127,19 @@ def load(name: str | Path) -> Model:
 
 
 def _fill(model: Model, state: dict[str, torch.Tensor]) -> None:
-    """Loads parameters; what does not fit is one line, where torch has one for each."""
+    """Loads parameters, or raises a ValueError of one line, where torch writes one for each parameter."""
     shapes = [{key: getattr(value, "shape", None) for key, value in s.items()} for s in (model.state_dict(), state)]
     wrong = [key for key in sorted(shapes[0].keys() | shapes[1].keys()) if shapes[0].get(key) != shapes[1].get(key)]
     if wrong:
-        raise ValueError(f"{len(wrong)} parameters are missing, too many or of another shape, such as {wrong[0]}")
+        raise ValueError(f"{len(wrong)} parameters are missing, unknown or of another shape, such as {wrong[0]}")
     model.load_state_dict(state)
 
 
 def _read(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.Tensor]]:
-    """What `save` wrote: name, arguments and parameters."""
+    """Returns what `save` wrote: name, arguments and parameters."""
     try:
         with safe_open(path, "pt") as file:
             about = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
         return about["name"], dict(about["arguments"]), load_file(path)
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not weights that `python -m ilnet train` wrote ({error})") from error
+        raise ValueError(f"{path}: not weights that `models.save` wrote ({error})") from error

@@ -10,7 +10,7 @@ import torch
 
 __all__ = ["read"]
 
-# Of their parameters, in ours.
+# Patterns of their parameters' names, and ours.
 _PARAMETERS = [
     (r"encoder\.head\.0\.conv\.", "encoder.head."),
     (r"encoder\.body\.(\d+)\.body\.0\.conv\.", r"encoder.blocks.\1.first."),
@@ -34,7 +34,8 @@ _PARAMETERS = [
     (r"outc\.conv\.0\.conv_block\.", "merge.3."),
     (r"outc\.conv\.1\.", "last."),
 ]
-# Of their models and arguments: what is None must have the value beside it, which is all that our model does.
+# Their models by name: ours, and for each of their arguments our name and their default. Where our name is None, our
+# model does only what the default says.
 _MODELS: dict[str, tuple[str, dict[str, tuple[str | None, Any]]]] = {
     "iln": ("iln", {"d": ("depth", 1), "h": ("heads", 8)}),
     "liif_lidar": (
@@ -49,16 +50,17 @@ _MODELS: dict[str, tuple[str, dict[str, tuple[str | None, Any]]]] = {
 
 
 def read(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.Tensor]]:
-    """Reads a checkpoint; nothing in it is ever executed.
+    """Reads a checkpoint. Nothing in it is ever executed.
 
     Args:
-        path: A file that the authors' code saved, `.pth`.
+        path: A `.pth` file that the authors' code saved.
 
     Returns:
-        Name and arguments for `models.create`, and the parameters for the model it makes.
+        Name and arguments for `models.create`, and the parameters of that model.
 
     Raises:
-        ValueError: If it is not such a file, holds anything but tensors and plain values, or a variant unknown here.
+        ValueError: If the file is not such a checkpoint, holds more than tensors and plain values, or holds a variant
+            that our models do not have.
     """
     try:
         checkpoint = torch.load(path, weights_only=True, map_location="cpu")

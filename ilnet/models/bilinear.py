@@ -12,17 +12,17 @@ class Nearest(Model):
     """The range of the pixel nearest to the query."""
 
     def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
-        """Answers queries (B, Q, 2) with ranges (B, Q) [m]."""
-        # A query moved onto a pixel centre has that pixel as its only neighbour with an area.
+        """Returns the ranges (B, Q) [m] of queries (B, Q, 2)."""
+        # For a query on a pixel centre, only that pixel has an area above 0.
         scores = queries.new_zeros(*queries.shape[:-1], 4)
         return gather_blend(image, queries.round(), scores, "bilinear", wrap, backend=self.backend)
 
 
 class Bilinear(Model):
-    """The neighbours' ranges weighted by area (paper, Eq. 2 with measured values), or their inverse ranges.
+    """The neighbours' ranges, or their inverse ranges, weighted by area (paper, Eq. 2 with measured values).
 
     Args:
-        inverse: Whether inverse ranges are interpolated, which keeps planes flat.
+        inverse: Whether to interpolate inverse ranges, which keeps planes flat.
     """
 
     def __init__(self, inverse: bool = False):
@@ -30,21 +30,21 @@ class Bilinear(Model):
         self.prior = "perspective" if inverse else "bilinear"
 
     def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
-        """Answers queries (B, Q, 2) with ranges (B, Q) [m]."""
+        """Returns the ranges (B, Q) [m] of queries (B, Q, 2)."""
         scores = queries.new_zeros(*queries.shape[:-1], 4)
         return gather_blend(image, queries, scores, self.prior, wrap, backend=self.backend)
 
 
 def interpolate_planes(image: torch.Tensor, queries: torch.Tensor, wrap: bool, backend: str) -> torch.Tensor:
-    """Ranges (B, Q) [m] of queries (B, Q, 2) in images (B, H, W) [m], as planes suggest; see `kernels.plane_prior`."""
+    """Returns ranges (B, Q) [m] of queries (B, Q, 2) in images (B, H, W) [m] by planes; see `kernels.plane_prior`."""
     return gather_blend(
         image, queries, plane_prior(image, queries, wrap, backend=backend), "none", wrap, backend=backend
     )
 
 
 class Planes(Model):
-    """What planes, the creases between them and the edges before them suggest; see `kernels.plane_prior`."""
+    """The planes around a query, continued to their crease or edge; see `kernels.plane_prior`."""
 
     def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
-        """Answers queries (B, Q, 2) with ranges (B, Q) [m]."""
+        """Returns the ranges (B, Q) [m] of queries (B, Q, 2)."""
         return interpolate_planes(image, queries, wrap, self.backend)

@@ -1,4 +1,4 @@
-"""The feature extractor of LIIF and ILN: EDSR without its upsampling tail (paper, Sec. II-B)."""
+"""The encoder of LIIF and ILN: EDSR without its upsampling tail (paper, Sec. II-B)."""
 
 from typing import Any
 
@@ -11,8 +11,8 @@ __all__ = ["Encoder"]
 class _Pad(torch.autograd.Function):
     """Adds one pixel on each side of (B, C, H, W): rows repeat, columns wrap around the seam or repeat.
 
-    By hand, since `F.pad` leaves the channels_last format, and the gradient of slices put together takes as long as the
-    convolution: each slice gets a gradient of the size of the whole.
+    Written by hand for speed: `F.pad` loses the channels_last format, and autograd through slices takes as long as the
+    convolution, since each slice gets a gradient of the size of the whole.
     """
 
     @staticmethod
@@ -60,10 +60,10 @@ class _ResidualBlock(nn.Module):
 
 
 class Encoder(nn.Module):
-    """One feature vector per pixel of a range image.
+    """Extracts one feature vector per pixel of a range image.
 
-    A head convolution, residual blocks of convolution, ReLU and convolution, a closing convolution, and a skip from
-    head to end; no normalisation layers, all kernels 3×3.
+    A head convolution, residual blocks of convolution, ReLU and convolution, a closing convolution, and a skip from the
+    head to the end. There are no normalisation layers, and all kernels are 3×3.
 
     Args:
         features: Channels C of every layer.
@@ -75,7 +75,7 @@ class Encoder(nn.Module):
         self.head = _Conv(1, features)
         self.blocks = nn.ModuleList(_ResidualBlock(features) for _ in range(blocks))
         self.tail = _Conv(features, features)
-        # The format in which convolutions are fast, and a pixel's features lie together for `gather_neighbours`.
+        # Convolutions are fast in this format, and it keeps the features of a pixel together for `gather_neighbours`.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, image: torch.Tensor, wrap: bool) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""The Implicit LiDAR Network: attention among the neighbours predicts how to weigh their ranges (paper, Sec. II)."""
+"""The Implicit LiDAR Network: attention among the neighbours predicts weights for their ranges (paper, Sec. II)."""
 
 from typing import NamedTuple
 
@@ -27,9 +27,9 @@ __all__ = ["ILN"]
 
 class _Encoded(NamedTuple):
     features: torch.Tensor
-    """(B, C, H, W), z of each pixel."""
+    """(B, C, H, W), the feature z of each pixel."""
     projected: Projected | None
-    """For the first attention; None where it is done token by token."""
+    """What the first attention needs of each pixel; None if it projects each query's tokens instead."""
 
 
 class _Attention(nn.Module):
@@ -75,21 +75,21 @@ class ILN(Model):
 
     Args:
         depth: Number of attention blocks D.
-        prior: What the untrained weights are close to: "none" (the paper), "bilinear" or "perspective", see
-            `kernels.gather_blend`, or "planes", see `kernels.plane_prior`. With a prior the head starts at zero: the
-            untrained network *is* that interpolation.
+        prior: The interpolation that untrained weights start from: "none" (the paper); "bilinear" or "perspective", see
+            `kernels.gather_blend`; or "planes", see `kernels.plane_prior`. With a prior the head starts at zero, so
+            that the untrained network *is* that interpolation.
         features: Channels of the encoder and of the attention.
         blocks: Residual blocks of the encoder.
         heads: Attention heads; they divide `features`.
-        dropout: Rate in the attention blocks while training; the authors' is 0.1.
-        snap: The network says which surface is seen, `kernels.plane_prior` where on it: in inference an answer that is
-            off from that of the planes by less than this share of the range is replaced by theirs.
-        area_floor: Least bilinear area in the prior, so that a measured pixel can be overruled.
-        sharpness: Of the step that "planes" expects at an edge; soft enough to learn where it is.
-        norm_range: Metres that the encoder sees as +1; no return is filled with it.
+        dropout: Dropout rate in the attention blocks during training; the authors use 0.1.
+        snap: Share of the range. In inference, a prediction that differs from that of `kernels.plane_prior` by less is
+            replaced by it: the network decides which surface is seen, the planes decide where on it.
+        area_floor: Least bilinear area in the prior; above 0, so that the network can overrule a measured pixel.
+        sharpness: Sharpness of the step that "planes" expects at an edge; low enough that its position can be learned.
+        norm_range: The range [m] that the encoder sees as +1; no return is filled with it.
 
     Raises:
-        ValueError: If the prior is unknown, the heads do not divide the features, or `snap` is no share.
+        ValueError: If the prior is unknown, the heads do not divide the features, or `snap` is not a share.
 
     Source: paper Sec. II-B, Figs. 2 and 3; sizes as in the authors' code. 1,244,673 parameters at D = 1.
     """
@@ -112,7 +112,7 @@ class ILN(Model):
         if heads < 1 or features % heads:
             raise ValueError(f"heads is {heads}; it should divide the {features} features")
         if not 0 <= snap < 1:
-            raise ValueError(f"snap is {snap}; it should be a share of the range, at least 0 and below 1")
+            raise ValueError(f"snap is {snap}; it should be at least 0 and below 1, a share of the range")
         super().__init__()
         self.prior, self.snap, self.area_floor, self.sharpness = prior, snap, area_floor, sharpness
         self.norm_range, self.dropout = norm_range, dropout
@@ -126,7 +126,7 @@ class ILN(Model):
         self.head = nn.Sequential(nn.LayerNorm(features), score)
 
     def encode(self, image: torch.Tensor, wrap: bool) -> _Encoded:
-        """Extracts features z from ranges (B, H, W) [m], scaled to [-1, 1]; projects them for the first attention."""
+        """Extracts features z from ranges (B, H, W) [m] and projects them for the first attention."""
         z = self.encoder(normalised(image, self.norm_range), wrap)
         if len(self.blocks) == 0 or (self.training and self.dropout > 0):
             return _Encoded(z, None)
@@ -136,7 +136,7 @@ class ILN(Model):
         return _Encoded(z, project_pixels(z, position, norm, first.qkv.weight, first.heads))
 
     def decode(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
-        """Weighs and blends the 4 neighbours of each query."""
+        """Blends the ranges of the 4 neighbours of each query, with predicted weights."""
         ranges = self._blend(encoded, image, queries, wrap)
         if self.training or self.snap == 0:
             return ranges
@@ -146,16 +146,16 @@ class ILN(Model):
     def _blend(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         features, projected = encoded
         blocks, prior, planes = self.blocks, self.prior, None
-        if prior == "planes":
+        if prior == "planes":  # scores to add, (B, Q, 4)
             options = {"sharpness": self.sharpness, "area_floor": self.area_floor}
             prior, planes = "none", plane_prior(image, queries, wrap, **options, backend=self.backend)
-        if projected is None:
-            z, offsets = gather_neighbours(features, queries, wrap, self.backend)
-            z = z + self.position(offsets * OFFSET_SCALE)
-        elif self.is_fused(encoded):
+        if projected is not None and self.is_fused(encoded):  # all that follows as one kernel
             floor, weights = self.area_floor, self._decoder_weights()
             return fused_decode(projected, image, queries, weights, prior, wrap, area_floor=floor, added=planes)
-        else:
+        if projected is None:  # tokens z (B, Q, 4, C): the feature of each neighbour and its embedded offset (Fig. 2)
+            z, offsets = gather_neighbours(features, queries, wrap, self.backend)
+            z = z + self.position(offsets * OFFSET_SCALE)
+        else:  # the same tokens after the first block, whose projections were computed once per pixel
             first, blocks = self._first(), self.blocks[1:]
             output = first.attention.out.weight, first.attention.out.bias
             z = neighbour_attention(projected, queries, output, wrap, backend=self.backend)
@@ -168,7 +168,7 @@ class ILN(Model):
         return gather_blend(image, queries, scores, prior, wrap, area_floor=self.area_floor, backend=self.backend)
 
     def is_fused(self, encoded: _Encoded) -> bool:
-        """Whether the whole decoder is one kernel: in inference, at depth 1, where `fused_decode` serves."""
+        """Returns whether the whole decoder is one kernel: in inference, at depth 1, if `fused_decode` can run."""
         projected, inference = encoded.projected, self.backend == "warp" and not torch.is_grad_enabled()
         return projected is not None and inference and len(self.blocks) == 1 and fused_decode_serves(projected)
 

@@ -1,4 +1,4 @@
-"""LiDAR-SR for range images: a U-Net that makes one denser image and no other (what the paper compares with)."""
+"""LiDAR-SR for range images: a U-Net that predicts images of one size only (the paper compares with it)."""
 
 from itertools import pairwise
 
@@ -36,20 +36,20 @@ class _Block(nn.Sequential):
 
 
 class LiDARSR(Model):
-    """r̂ = U(I) at all pixels of one denser image at once: what a network without queries does.
+    """r̂ = U(I) for all pixels of one denser image at once: a network without queries.
 
-    The image is doubled until it has the target's size, halved four times and doubled again, each time beside what had
-    that size before. A query is answered with the pixel nearest to it. Columns do not meet at the seam, as in the
-    authors' code: convolutions see zeros beyond the image.
+    The image is doubled until it has the target's size. A U-Net then halves it four times and doubles it again, with a
+    skip at each size. A query gets the pixel nearest to it. Columns do not meet at the seam, as in the authors' code:
+    convolutions see zeros beyond the image.
 
     Args:
-        rows: How many times the input's rows are predicted, a power of two.
-        columns: How many times its columns, a power of two.
-        dropout: Rate of whole channels while training.
-        norm_range: Metres that the network sees, and predicts, as 1; no return is filled with it.
+        rows: Rows of the prediction over those of the input, a power of two.
+        columns: Columns of the prediction over those of the input, a power of two.
+        dropout: Dropout rate of whole channels during training.
+        norm_range: The range [m] that the network sees, and predicts, as 1; no return is filled with it.
 
     Raises:
-        ValueError: If rows or columns is no power of two, or both are 1.
+        ValueError: If rows or columns is not a power of two, or both are 1.
 
     Source: T. Shan et al., "Simulation-based lidar super-resolution for ground vehicles", RAS 2020; sizes as in the
         code of the paper's authors. 34.6 million parameters.
@@ -73,14 +73,14 @@ class LiDARSR(Model):
         self.merge = nn.ModuleList(_Block(*widths) for widths in pairwise(_WIDTHS[::-1]))
         self.last = nn.Conv2d(_WIDTHS[0], 1, 1)
         self.dropout = nn.Dropout2d(dropout)
-        # A sixth less time on a CPU.
+        # This format saves a sixth of the time on a CPU.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def check_sensors(self, source: Sensor, target: Sensor) -> None:
-        """Refuses all but one target size, and rays that are not where the network takes them to be.
+        """Refuses all target sizes but one, and rays that are not where the network expects them.
 
         Raises:
-            ValueError: If `target` has another size than the network makes of `source`, or looks elsewhere.
+            ValueError: If `target` has another size than the network predicts from `source`, or looks elsewhere.
         """
         size = source.shape[0] * self.rows, source.shape[1] * self.columns
         what = f"lidar-sr at {self.rows}x{self.columns} makes {size[0]}x{size[1]} rays of this scan"
@@ -94,7 +94,7 @@ class LiDARSR(Model):
             raise ValueError(f"{what}, evenly over its field of view; {target} looks elsewhere")
 
     def encode(self, image: torch.Tensor, wrap: bool) -> torch.Tensor:
-        """Predicts the denser image (B, H rows, W columns) [m] of ranges (B, H, W) [m], which it sees in [0, 1]."""
+        """Returns the denser image (B, H·rows, W·columns) [m] of ranges (B, H, W) [m], which it scales to [0, 1]."""
         x = self.widen((image.clamp(max=self.norm_range) / self.norm_range).unsqueeze(1))
         before = []
         for block in self.down:
@@ -105,9 +105,9 @@ class LiDARSR(Model):
         return self.last(x).relu().squeeze(1).to(image.dtype) * self.norm_range
 
     def decode(self, dense: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
-        """Answers queries (B, Q, 2) with the nearest pixels (B, Q) [m] of the denser image."""
+        """Returns the pixels (B, Q) [m] of the denser image that are nearest to queries (B, Q, 2)."""
         (height, width), (rows, columns) = image.shape[1:], dense.shape[1:]
-        # Outermost rows stay where they are, as do outermost columns where there is no seam.
+        # The outermost rows stay where they are, and without a seam the outermost columns as well.
         row = queries[..., 0] * ((rows - 1) / (height - 1))
         column = queries[..., 1] * (self.columns if wrap else (columns - 1) / (width - 1))
         row = row.round().long().clamp(0, rows - 1)

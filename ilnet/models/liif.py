@@ -1,4 +1,4 @@
-"""LIIF for range images: a network predicts the values of the neighbours, areas weigh them (paper, Eq. 2)."""
+"""LIIF for range images: a network predicts a value for each neighbour, and areas weight them (paper, Eq. 2)."""
 
 from itertools import pairwise
 
@@ -13,13 +13,13 @@ __all__ = ["LIIF"]
 
 
 class LIIF(Model):
-    """r̂ = Σ_t (S_t / S) h(z'_t): what the paper improves on.
+    """r̂ = Σ_t (S_t / S) h(z'_t), which the paper improves on.
 
     Args:
         features: Channels of the encoder.
         blocks: Residual blocks of the encoder.
         hidden: Width of the four hidden layers of h.
-        norm_range: Metres that the network sees, and predicts, as +1; no return is filled with it.
+        norm_range: The range [m] that the network sees, and predicts, as +1; no return is filled with it.
 
     Source: paper Eq. 2 and Sec. II-A; sizes as in the authors' code, without feature unfolding and cell decoding.
         1,434,049 parameters.
@@ -41,7 +41,7 @@ class LIIF(Model):
         """Predicts and blends the values of the 4 neighbours of each query."""
         z, offsets = gather_neighbours(features, queries, wrap, self.backend)
         hidden = self.value[:-1](torch.cat((z, (offsets * OFFSET_SCALE).to(z.dtype)), -1))
-        # Where layers run in bfloat16, the last one does not: near 1 a step of bfloat16 is 0.004, which is 20 cm.
+        # The last layer always runs in float32: near 1, the spacing of bfloat16 is 0.004, which is 20 cm.
         with torch.autocast(z.device.type, enabled=False):
             values = self.value[-1](hidden.float()).squeeze(-1)
         return (area_blend(values, queries, self.backend) + 1) * (self.norm_range / 2)

@@ -166,16 +166,21 @@ def test_the_head_of_a_network_with_a_prior_gets_a_gradient(yard):
     assert model.head[1].weight.grad.abs().max() > 0
 
 
+def train_in_yard(out, processes, *arguments):
+    out.mkdir()
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1"}
+    launcher = ["-m", "torch.distributed.run", f"--nproc-per-node={processes}", "--master-port=0", "--standalone"]
+    script = Path(__file__).with_name("train_in_yard.py")
+    command = [sys.executable, *(launcher if processes > 1 else []), str(script), str(out), *arguments]
+    # A process that waits in vain for another would do so for half an hour.
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
 def test_two_processes_share_a_batch_and_agree_with_one(tmp_path):
     """The same gradients in both, those of one process, and the same figures over all held-out scans."""
-    script = Path(__file__).with_name("train_in_yard.py")
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1"}
-    launcher = ["-m", "torch.distributed.run", "--nproc-per-node=2", "--master-port=0", "--standalone"]
-    for name, prefix in (("one", []), ("two", launcher)):
-        (tmp_path / name).mkdir()
-        command = [sys.executable, *prefix, str(script), str(tmp_path / name)]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr[-3000:]
+    for name, processes in (("one", 1), ("two", 2)):
+        train_in_yard(tmp_path / name, processes)
     alone = torch.load(tmp_path / "one" / "rank-alone.pt")
     for rank in (0, 1):
         shared = torch.load(tmp_path / "two" / f"rank-{rank}.pt")
@@ -189,13 +194,62 @@ def test_two_processes_share_a_batch_and_agree_with_one(tmp_path):
     assert alone["gradients"][0]["model.head.1.weight"].abs().max() > 0
 
 
-def test_a_loss_that_is_not_a_number_stops_and_keeps_the_batch(tmp_path, quick, monkeypatch):
+def test_a_loss_that_is_not_finite_stops_and_keeps_the_batch(tmp_path, quick, monkeypatch):
     monkeypatch.setattr(data.ContinuousRays, "_draw", spoilt(data.ContinuousRays._draw, 2))
-    with pytest.raises(ValueError, match=r"the loss of step 2 is nan.*step-2.pt"):
+    with pytest.raises(ValueError, match=r"the loss of step 2 is nan.*step-2.pt .*weights of step 0"):
         quick(tmp_path)
     kept = torch.load(tmp_path / "iln-prior" / "step-2.pt")
     assert kept["batch"]["ranges"].isnan().any()
-    assert "head.1.weight" in kept["model"]
+    first = models.create("iln-prior", blocks=1, features=16, heads=4)
+    assert kept["model"].keys() == first.state_dict().keys()
+    assert all(weight.isfinite().all() for weight in kept["model"].values())
+
+
+@pytest.mark.parametrize("checkpoint_every", [2, 100])
+def test_no_checkpoint_holds_weights_after_a_loss_that_is_not_finite(tmp_path, quick, monkeypatch, checkpoint_every):
+    """Whether it is time for a checkpoint or for a validation."""
+    monkeypatch.setattr(train, "CHECKPOINT_EVERY", checkpoint_every)
+    monkeypatch.setattr(train, "VALIDATE_EVERY", (3, 3))
+    monkeypatch.setattr(data.ContinuousRays, "_draw", spoilt(data.ContinuousRays._draw, 4))
+    with pytest.raises(ValueError, match=r"the loss of step 4 is nan.*weights of step [34]"):
+        quick(tmp_path, steps=9)
+    kept = torch.load(tmp_path / "iln-prior" / "last.ckpt", weights_only=True)
+    assert kept["global_step"] in (3, 4)
+    assert all(weight.isfinite().all() for weight in kept["state_dict"].values())
+
+
+def test_a_loss_is_read_every_few_steps_only(tmp_path, quick, monkeypatch):
+    read = []
+    original = train._Watch._read
+    monkeypatch.setattr(
+        train._Watch, "_read", lambda watch, *of: read.append(len(watch.unread)) or original(watch, *of)
+    )
+    quick(tmp_path, steps=23)
+    assert [count for count in read if count] == [10, 10, 3]
+
+
+def test_all_processes_stop_when_the_loss_of_one_is_not_finite(tmp_path):
+    train_in_yard(tmp_path / "two", 2, "1")
+    said = [(tmp_path / "two" / f"rank-{rank}.txt").read_text() for rank in (0, 1)]
+    assert said[0] == "the loss of step 1 is not finite in another process"
+    assert said[1].startswith("the loss of step 1 is nan; it should be finite: ")
+    [kept] = (tmp_path / "two" / "iln-prior").glob("step-*.pt")
+    assert kept.name == "step-1-process-1.pt"
+    assert torch.load(kept)["batch"]["ranges"].isnan().all()
+
+
+def test_each_process_has_a_gpu_of_its_own(monkeypatch):
+    chosen = []
+    monkeypatch.setattr(train.simulate, "best_device", lambda: torch.device("cuda"))
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "set_device", chosen.append)
+    assert train._device() == torch.device("cuda", 0)
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert train._device() == torch.device("cuda", 1)
+    assert chosen == [0, 1]
+    monkeypatch.setenv("LOCAL_RANK", "2")
+    with pytest.raises(ValueError, match="LOCAL_RANK is 2; it should be below 2: start one process for each GPU"):
+        train._device()
 
 
 def spoilt(draw, bad):
@@ -215,11 +269,11 @@ def test_stored_images_are_learned_from(tmp_path, quick, monkeypatch):
     monkeypatch.setitem(train.PRESETS, "tiny", dataclasses.replace(train.PRESETS["tiny"], crops=2, columns=1024))
     figures = quick(tmp_path / "out", archive=tmp_path / "data")
     assert set(figures) == {f"val/{name}" for name in metrics.FIGURES}
-    with pytest.raises(ValueError, match=r"iln with preset paper learns from stored images.*128x2048 .*--data DIR"):
+    with pytest.raises(ValueError, match=r"archive is None; .*16x1024 and 128x2048, .* iln with preset paper learns"):
         train.train("iln", "paper", tmp_path)
-    with pytest.raises(ValueError, match=r"lidar-sr with preset tiny learns from stored images.*16x1024,64x1024"):
+    with pytest.raises(ValueError, match=r"archive is None; .*16x1024 and 64x1024, .* lidar-sr with preset tiny"):
         train.train("lidar-sr", "tiny", tmp_path, target=(64, 1024))
-    with pytest.raises(ValueError, match=r"size is 70x1024; for lidar-sr it should be a multiple of 16x1024"):
+    with pytest.raises(ValueError, match=r"target is 70x1024; for lidar-sr it should be a multiple of 16x1024"):
         train.train("lidar-sr", "tiny", tmp_path, archive=tmp_path / "data", target=(70, 1024))
     with pytest.raises(FileNotFoundError, match="no such folder"):
         quick(tmp_path / "out2", archive=tmp_path / "nothing")

@@ -276,7 +276,7 @@ BAD = {
     "another variant": (("liif_lidar", {"feat_unfold": True}), "feat_unfold = True; only False"),
     "another depth": (
         ("iln", {"d": 2, "h": 8}),
-        "parameters are missing, too many or of another shape, such as blocks.1",
+        "parameters are missing, unknown or of another shape, such as blocks.1",
     ),
     "another number of heads": (("iln", {"d": 1, "h": 7}), "heads is 7"),
     "arguments that are none": (("iln", {"d": "one", "h": 8}), "not weights of iln"),
