@@ -1,4 +1,4 @@
-"""Pictures of towns: each from above and from the street, a scan of each, and a sheet of them all."""
+"""Draws pictures of towns: each from above, from the street and as a scan, and one sheet of all."""
 
 from pathlib import Path
 
@@ -10,14 +10,13 @@ from ilnet.commands import plot
 from ilnet.scan import Scan
 from ilnet.sensor import preset
 from ilnet.world import simulate
-from ilnet.world.places import SENSOR_HEIGHT
-from ilnet.world.towns import Town, build, traffic
+from ilnet.world.towns import SENSOR_HEIGHT, Town, build, traffic
 from kernels import Mesh
 
 __all__ = ["draw"]
 
-# Where the street is drawn and scanned, as a share of the waypoints; chosen for the view.
-_PLACES = {
+# Which waypoint each town is seen and scanned from, as a share of all; chosen for the view.
+_VIEWPOINTS = {
     "town01": 0.2,
     "town02": 0.03,
     "town03": 0.12,
@@ -28,7 +27,9 @@ _PLACES = {
     "town10": 0.02,
 }
 _SENSOR = preset("paper-128x2048")
+# Width and height of the two views [pixels].
 _ABOVE, _STREET = (1200, 900), (1200, 600)
+# Towns per row of the sheet, and width of each [pixels].
 _SHEET_COLUMNS, _SHEET_WIDTH = 4, 400
 _COLOURS = {
     "ground": (208, 202, 186),
@@ -43,23 +44,23 @@ _COLOURS = {
 
 
 def draw(names: list[str], out: Path) -> list[Path]:
-    """Builds towns with seed 0, draws and scans them.
+    """Builds towns with seed 0, draws them and scans them.
 
     Args:
-        names: Which towns.
-        out: Folder for the pictures; made where missing.
+        names: Names of the towns.
+        out: Folder for the pictures; it is made if it is missing.
 
     Returns:
-        The files: two views of each town, the scans as range images and as points, and the sheet `towns.png`.
+        The files: two views of each town, the scans as range images and as points, and a sheet of all views.
 
     Raises:
-        ValueError: For an unknown name.
+        ValueError: If one of `names` is not a town.
     """
     files, scans, panels = [], {}, []
     for name in names:
         town = build(name)
         out.mkdir(parents=True, exist_ok=True)
-        number = int(_PLACES[name] * len(town.waypoints))
+        number = int(_VIEWPOINTS[name] * len(town.waypoints))
         at = town.waypoints[number] + np.array([0, 0, SENSOR_HEIGHT], dtype=np.float32)
         heading = float(town.headings[number])
         about = traffic(town, at, 0)
@@ -79,7 +80,7 @@ def draw(names: list[str], out: Path) -> list[Path]:
 
 
 def _scan(town: Town, about: tuple[np.ndarray, np.ndarray], at: np.ndarray, heading: float) -> Scan:
-    """A scan of a town with its traffic."""
+    """Returns a scan of a town with its traffic, from a sensor at `at` (3,) [m] that looks along `heading` [rad]."""
     vertices = np.concatenate([town.vertices, about[0]])
     triangles = np.concatenate([town.triangles, about[1] + len(town.vertices)])
     mesh = Mesh(vertices, triangles, simulate.best_device())
@@ -87,19 +88,19 @@ def _scan(town: Town, about: tuple[np.ndarray, np.ndarray], at: np.ndarray, head
 
 
 def _surface(vertices: np.ndarray, triangles: np.ndarray, paint: np.ndarray):
-    """A surface to draw in colours (3,) or (F, 3)."""
-    import pyvista  # here and not above: it takes a second to import
+    """Returns a surface to draw, in one colour (3,) or a colour per triangle (F, 3)."""
+    import pyvista  # It takes a second to import, so only those who draw do.
 
     surface = pyvista.PolyData.from_regular_faces(vertices, triangles)
     surface.cell_data["paint"] = np.broadcast_to(paint, (len(triangles), 3)).astype(np.uint8)
     return surface
 
 
-def _near(places: np.ndarray, xy: np.ndarray, reach: int) -> np.ndarray:
-    """Whether points (N, 2) are within about `reach` metres of any of the places (M, 2)."""
-    low = np.minimum(places.min(0), xy.min(0)) - reach - 2
-    cells = np.zeros(np.ceil(np.maximum(places.max(0), xy.max(0)) + reach + 2 - low).astype(int), dtype=bool)
-    i, j = np.round(places - low).astype(int).T
+def _near(spots: np.ndarray, xy: np.ndarray, reach: int) -> np.ndarray:
+    """Returns which of points `xy` (N, 2) [m] are within about `reach` metres of a spot (M, 2), as (N,) bool."""
+    low = np.minimum(spots.min(0), xy.min(0)) - reach - 2
+    cells = np.zeros(np.ceil(np.maximum(spots.max(0), xy.max(0)) + reach + 2 - low).astype(int), dtype=bool)
+    i, j = np.round(spots - low).astype(int).T
     for x in range(-reach, reach + 1):
         for y in range(-reach, reach + 1):
             if x * x + y * y <= reach * reach:
@@ -109,17 +110,17 @@ def _near(places: np.ndarray, xy: np.ndarray, reach: int) -> np.ndarray:
 
 
 def _painted(town: Town):
-    """A town in the colours that its shapes suggest: the mesh does not say what is what."""
+    """Returns a town in colours that its shapes suggest, as its mesh does not tell walls from leaves."""
     vertices, triangles = town.vertices, town.triangles
     a, b, c = (vertices[triangles[:, k]].astype(np.float64) for k in range(3))
     normal = np.cross(b - a, c - a)
     twice = np.linalg.norm(normal, axis=1)
     upright = np.abs(normal[:, 2]) / np.maximum(twice, 1e-9)
-    lone = np.bincount(triangles.ravel())[triangles].max(1) == 1  # leaves and ground share no corners
+    lone = np.bincount(triangles.ravel())[triangles].max(1) == 1  # Leaves and ground share no corners.
     paint = np.full((len(triangles), 3), _COLOURS["wall"], dtype=np.uint8)
     paint[lone & (upright > 0.9)] = _COLOURS["ground"]
     middle = ((a + b + c) / 3)[:, :2]
-    kerbs = middle[lone & (upright > 0.98) & (np.abs(twice - 1) < 0.05)]  # where the ground has cells of 1 m
+    kerbs = middle[lone & (upright > 0.98) & (np.abs(twice - 1) < 0.05)]  # The ground has cells of 1 m there.
     paved = _near(kerbs, middle, 6) | _near(town.waypoints[:, :2], middle, 7) | _near(town.walks[:, :2], middle, 4)
     paint[lone & (upright > 0.9) & (twice > 12) & ~paved] = _COLOURS["lawn"]
     paint[lone & (twice < 0.8) & (upright < 0.99)] = _COLOURS["leaf"]
@@ -128,7 +129,7 @@ def _painted(town: Town):
 
 
 def _lanes(town: Town):
-    """The lanes as dark ribbons just above the carriageway."""
+    """Returns the lanes as dark ribbons just above the carriageway."""
     start, end = town.waypoints[:-1].astype(np.float64), town.waypoints[1:].astype(np.float64)
     way = end - start
     length = np.hypot(way[:, 0], way[:, 1])
@@ -144,10 +145,19 @@ def _lanes(town: Town):
 def _render(
     surfaces: list, camera: list, angle: float, size: tuple[int, int], reach: tuple[float, float], occlusion: float
 ) -> Image.Image:
-    """Draws surfaces with sun, sky and soft shade in the corners, at twice the size and then shrunk."""
+    """Returns a picture of surfaces with sun, sky and soft shade in the corners.
+
+    Args:
+        surfaces: What to draw.
+        camera: Position, the point it looks at, and the upward direction, metres.
+        angle: Vertical field of view, degrees.
+        size: Width and height, pixels; it is drawn at twice the size and then shrunk.
+        reach: Nearest and farthest distance that is drawn, metres.
+        occlusion: How far the soft shade reaches, metres.
+    """
     import pyvista
 
-    # Without a screen VTK warns of its absence, then renders all the same.
+    # Without a screen VTK warns, but renders.
     with pyvista.vtk_verbosity("off"):
         plotter = pyvista.Plotter(off_screen=True, window_size=[2 * s for s in size], lighting="none")
         plotter.renderer.set_background(_COLOURS["sky"])
@@ -166,7 +176,7 @@ def _render(
 
 
 def _from_above(town: Town) -> Image.Image:
-    """The whole town, from the south-west."""
+    """Returns a picture of the whole town from the south-west."""
     low, high = town.waypoints.min(0), town.waypoints.max(0)
     centre, reach = 0.5 * (low + high), 0.5 * float((high - low)[:2].max())
     eye = centre + reach * np.array([-0.75, -1.75, 1.75])
@@ -176,7 +186,7 @@ def _from_above(town: Town) -> Image.Image:
 
 
 def _from_the_street(town: Town, about: tuple[np.ndarray, np.ndarray], at: np.ndarray, heading: float) -> Image.Image:
-    """What the sensor's car has before it."""
+    """Returns a picture of what lies ahead of the sensor at `at` (3,) [m]."""
     surfaces = [_painted(town), _lanes(town)]
     if len(about[1]):
         surfaces.append(_surface(*about, np.array(_COLOURS["traffic"])))
@@ -185,7 +195,7 @@ def _from_the_street(town: Town, about: tuple[np.ndarray, np.ndarray], at: np.nd
 
 
 def _sheet(panels: list[tuple[str, Image.Image, Image.Image]]) -> Image.Image:
-    """Both views of each town under its name, side by side."""
+    """Returns a sheet with both views of each town under its title."""
     columns = min(_SHEET_COLUMNS, len(panels))
     caption, gap = 22, 6
     sizes = [(_SHEET_WIDTH, _SHEET_WIDTH * h // w) for w, h in (_ABOVE, _STREET)]
@@ -200,4 +210,4 @@ def _sheet(panels: list[tuple[str, Image.Image, Image.Image]]) -> Image.Image:
         for view, size in zip(views, sizes, strict=True):
             sheet.paste(view.resize(size, Image.Resampling.LANCZOS), (x, y))
             y += size[1] + gap // 2
-    return sheet.quantize(160)  # a palette makes the file a third
+    return sheet.quantize(160)  # With a palette the file is a third as large.

@@ -1,13 +1,25 @@
-"""Procedural towns: streets of triangles to drive a simulated LiDAR through, and traffic drawn anew for each scan."""
+"""Procedural towns: streets of triangles to drive a simulated LiDAR through, and traffic drawn anew for each scan.
+
+How a plan (`town01.py` to `town10.py`) becomes a town (the steps are in `plan.py`):
+
+1. The ground is laid and the streets are cut into it (`streets.py`).
+2. The landmarks of this plan are set on it (`landmarks.py`).
+3. Each side of each street is filled with lots: buildings, gardens, yards (`frontage.py`, `buildings.py`).
+4. The streets and fields are dressed: lamps, signs, parking, trees (`dressing.py`, `furniture.py`, `plants.py`).
+5. The site (`site.py`), which has collected all this, gives the town: mesh, waypoints and spots (`town.py`).
+
+Afterwards `traffic.py` places vehicles and people (`vehicles.py`) around a sensor.
+"""
 
 from ilnet.world.towns import town01, town02, town03, town04, town05, town06, town07, town10
-from ilnet.world.towns.plan import raise_town
-from ilnet.world.towns.town import Town
+from ilnet.world.towns.plan import build_town
+from ilnet.world.towns.town import SENSOR_HEIGHT, Town
 from ilnet.world.towns.traffic import traffic
 
-__all__ = ["NAMES", "TEST", "TRAIN", "WAYPOINTS", "Town", "build", "traffic"]
+__all__ = ["NAMES", "SENSOR_HEIGHT", "TEST", "TRAIN", "WAYPOINTS", "Town", "build", "traffic"]
 
-# plans, and how many waypoints to keep: 22,244 in the towns to train in and 2,847 in those to test in, as in the paper
+# Each plan with its number of waypoints. As in the paper, the towns for training (the first six) have 22,244 and the
+# towns for testing 2,847.
 _TOWNS = {
     "town01": (town01.PLAN, 3050),
     "town02": (town02.PLAN, 2620),
@@ -24,16 +36,16 @@ WAYPOINTS = {name: count for name, (_, count) in _TOWNS.items()}
 
 
 def build(name: str, seed: int = 0) -> Town:
-    """Build a town; the same name and seed give the same arrays everywhere.
+    """Returns a town; the same name and seed give the same arrays on every machine.
 
     Args:
-        name: one of NAMES.
-        seed: another seed gives another town of the same character.
+        name: One of `NAMES`.
+        seed: Another seed gives another town of the same character.
 
     Raises:
-        ValueError: for an unknown name.
+        ValueError: If `name` is not one of `NAMES`.
     """
     if name not in _TOWNS:
-        raise ValueError(f"name is {name!r}, should be one of: {', '.join(NAMES)}")
+        raise ValueError(f"name is {name!r}; it should be one of: {', '.join(NAMES)}")
     plan, waypoints = _TOWNS[name]
-    return raise_town(plan, name, seed, waypoints)
+    return build_town(plan, name, seed, waypoints)

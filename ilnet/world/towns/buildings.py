@@ -1,4 +1,8 @@
-"""Buildings. In their own frame the front runs along x, centred, at y = 0 and faces -y; the floor is z = 0; metres."""
+"""Buildings, from sheds to churches.
+
+In a building's own frame the front runs along x, centred, at y = 0 and faces -y. The ground is z = 0. Lengths are in
+metres.
+"""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -6,21 +10,23 @@ from numpy.typing import ArrayLike
 from ilnet.world.towns.furniture import railing
 from ilnet.world.towns.parts import Part, boxes, loft, merge, place, quads, shift, tubes
 
-__all__ = ["barn", "block", "church", "hall", "house", "shed", "tower", "wall"]
+__all__ = ["barn", "block", "church", "hall", "house", "shed", "tower"]
 
-_FOOTING = 4.0  # walls go this deep, so that sloping ground never opens a gap [m]
-_SEEN = 24.0  # no ray of a street LiDAR meets a wall higher than this within its range [m]
+_FOOTING = 4.0  # Walls go this deep [m], so that sloping ground opens no gap under them.
+_SEEN = (
+    24.0  # Walls have no openings above this [m]: no ray of a LiDAR in the street meets them there within its range.
+)
 
 
-def wall(width: float, low: float, high: float, openings: ArrayLike, depth: ArrayLike) -> Part:
-    """A wall along +x from the origin that faces -y, with recessed openings.
+def _wall(width: float, low: float, high: float, openings: ArrayLike, depth: ArrayLike) -> Part:
+    """Returns a wall along +x from the origin that faces -y, with recessed openings.
 
     Args:
-        width: metres.
-        low: height of its foot, metres.
-        high: height of its top, metres.
-        openings: (K, 4) x0, x1, z0, z1, not overlapping, metres.
-        depth: how deep the openings are, scalar or (K,), metres.
+        width: Length along x, metres.
+        low: Height of its foot, metres.
+        high: Height of its top, metres.
+        openings: (K, 4) bounds x0, x1, z0, z1 of openings that do not overlap, metres.
+        depth: Scalar or (K,) depth of the openings, metres.
     """
     openings = np.asarray(openings, dtype=np.float64).reshape(-1, 4)
     depth = np.broadcast_to(np.asarray(depth, dtype=np.float64), (len(openings),))
@@ -56,7 +62,14 @@ def wall(width: float, low: float, high: float, openings: ArrayLike, depth: Arra
 
 
 def _windows(width: float, pitch: float, size: tuple[float, float], sill: float) -> np.ndarray:
-    """Openings (K, 4) of one storey, evenly spread over a wall."""
+    """Returns the openings (K, 4) of one storey, evenly spread over a wall, as `_wall` takes them.
+
+    Args:
+        width: Length of the wall, metres.
+        pitch: Smallest distance from one opening to the next, metres.
+        size: Width and height of an opening, metres.
+        sill: Height of the lower edge, metres.
+    """
     count = max(int((width - 0.8) / pitch), 0)
     centre = (np.arange(count) + 0.5) * width / max(count, 1)
     one = np.ones(count)
@@ -64,14 +77,14 @@ def _windows(width: float, pitch: float, size: tuple[float, float], sill: float)
 
 
 def _around(walls: list[Part], width: float, depth: float, front: float = 0.0) -> Part:
-    """Four walls (front, right, back, left) turned into place around a footprint."""
+    """Returns four walls (front, right, back, left) around a footprint whose front is at y = `front`; all in metres."""
     half = width / 2
     at = [(-half, front, 0), (half, front, 0), (half, depth, 0), (-half, depth, 0)]
     return merge([place(w, p, k * np.pi / 2) for k, (w, p) in enumerate(zip(walls, at, strict=True))])
 
 
 def _trim(openings: np.ndarray, rich: int) -> Part:
-    """Sills, and mullions where rich is 2, for the openings of a wall along +x."""
+    """Returns sills for the openings (K, 4) of a wall along +x, and mullions where `rich` is 2."""
     x0, x1, z0, z1 = openings.T
     zero = np.zeros(len(x0))
     low, high = np.column_stack([x0 - 0.1, zero, z0 - 0.08]), np.column_stack([x1 + 0.1, zero, z0])
@@ -91,6 +104,7 @@ def _trim(openings: np.ndarray, rich: int) -> Part:
 
 
 def _flat_roof(width: float, depth: float, z: float, parapet: float) -> Part:
+    """Returns a flat roof at height `z` with a wall of height `parapet` around it; all in metres."""
     h, t, e = width / 2, 0.25, 0.06
     low = [[-h - e, -e, z], [-h - e, depth - t, z], [-h - e, t, z], [h - t, t, z]]
     high = [[h + e, t, z], [h + e, depth + e, z], [-h + t, depth - t, z], [h + e, depth - t, z]]
@@ -99,7 +113,16 @@ def _flat_roof(width: float, depth: float, z: float, parapet: float) -> Part:
 
 
 def _gable_roof(width: float, depth: float, z: float, rise: float, eaves: float, verge: float) -> Part:
-    """Two slopes with the ridge along x."""
+    """Returns two slopes with the ridge along x, gables and gutters.
+
+    Args:
+        width: Length of the house along the ridge, metres.
+        depth: Length of the house across the ridge, metres.
+        z: Height of the walls, metres.
+        rise: Height of the ridge above the walls, metres.
+        eaves: Overhang beyond front and back, metres.
+        verge: Overhang beyond the gables, metres.
+    """
     slope, t, mid = rise / (depth / 2), 0.16, depth / 2
     out = z - eaves * slope
     section = np.array(
@@ -127,7 +150,7 @@ def _gable_roof(width: float, depth: float, z: float, rise: float, eaves: float,
 
 
 def _hip_roof(width: float, depth: float, z: float, rise: float, eaves: float) -> Part:
-    """Four slopes over eaves."""
+    """Returns four slopes with an overhang `eaves` on all sides; arguments as for `_gable_roof`."""
     h, e = width / 2, eaves
     low = z - 0.1
     inset = min(depth / 2, 0.8 * h)
@@ -138,6 +161,7 @@ def _hip_roof(width: float, depth: float, z: float, rise: float, eaves: float) -
 
 
 def _chimney(x: float, y: float, z: float, height: float) -> Part:
+    """Returns a chimney with two pots that rises `height` above z; all in metres."""
     stack = boxes([x - 0.35, y - 0.3, z - 1.5], [x + 0.35, y + 0.3, z + height])
     pots = tubes(
         [[x - 0.15, y, z + height], [x + 0.15, y, z + height]],
@@ -150,7 +174,13 @@ def _chimney(x: float, y: float, z: float, height: float) -> Part:
 
 
 def _balcony(width: float, out: float, solid: bool) -> Part:
-    """A balcony centred on x = 0 that stands out to -y from the wall, its slab's top at z = 0."""
+    """Returns a balcony in front of a wall at y = 0, centred on x = 0, with its floor at z = 0.
+
+    Args:
+        width: Length along the wall, metres.
+        out: How far it projects from the wall, metres.
+        solid: Whether it has a parapet instead of a railing.
+    """
     slab = boxes([-width / 2, -out, -0.16], [width / 2, 0, 0])
     if solid:
         low = [[-width / 2, -out, 0], [-width / 2, -out, 0], [width / 2 - 0.08, -out, 0]]
@@ -166,10 +196,10 @@ def _balcony(width: float, out: float, solid: bool) -> Part:
 
 
 def shed(rng: np.random.Generator, width: float, depth: float, height: float) -> Part:
-    """A garage or a shed: one storey, a wide door, a low roof."""
+    """Returns a garage or a shed, with one storey, a wide door and a low roof; all in metres."""
     door = [[width * 0.15, width * 0.8, 0, min(2.3, height - 0.2)]]
     walls = [
-        wall(w, -_FOOTING, height, door if k == 0 else [], 0.2) for k, w in enumerate((width, depth, width, depth))
+        _wall(w, -_FOOTING, height, door if k == 0 else [], 0.2) for k, w in enumerate((width, depth, width, depth))
     ]
     roof = (
         _flat_roof(width, depth, height, 0.12)
@@ -180,14 +210,14 @@ def shed(rng: np.random.Generator, width: float, depth: float, height: float) ->
 
 
 def house(rng: np.random.Generator, width: float, depth: float, floors: int, detached: bool) -> Part:
-    """A house with a pitched roof, a door, windows, and perhaps porch, chimney, dormers.
+    """Returns a house with a pitched roof, a door and windows; it may have a porch, a chimney or dormers.
 
     Args:
-        rng: source of the variety.
-        width: along the street, metres.
-        depth: metres.
-        floors: storeys below the roof.
-        detached: whether it stands free, with windows and eaves on all sides.
+        rng: Source of the variety.
+        width: Length along the street, metres.
+        depth: From the front to the back, metres.
+        floors: Number of storeys below the roof.
+        detached: Whether it stands free, with windows and eaves on all sides.
     """
     storey = rng.uniform(2.7, 3.0)
     base = rng.uniform(0.15, 0.5)
@@ -211,7 +241,7 @@ def house(rng: np.random.Generator, width: float, depth: float, floors: int, det
         openings = np.concatenate(rows)
         if not detached and k % 2 == 1:
             openings = openings[:0]
-        part = wall(length, -_FOOTING, top, openings, recess)
+        part = _wall(length, -_FOOTING, top, openings, recess)
         walls.append(merge([part, _trim(openings, rich)]) if rich and len(openings) and k == 0 else part)
     parts = [_around(walls, width, depth)]
     door_x -= width / 2
@@ -227,7 +257,7 @@ def house(rng: np.random.Generator, width: float, depth: float, floors: int, det
         for x in np.arange(-width / 2 + 2.0, width / 2 - 1.8, 3.2)[: int(rng.integers(0, 4))]:
             y = 0.22 * depth
             z = top + 0.44 * rise
-            front = wall(1.5, z - 0.8, z + 1.3, [[0.25, 1.25, z + 0.1, z + 1.1]], 0.12)
+            front = _wall(1.5, z - 0.8, z + 1.3, [[0.25, 1.25, z + 0.1, z + 1.1]], 0.12)
             cheeks = boxes(
                 [[x, y + 0.01, z - 0.8], [x + 1.45, y + 0.01, z - 0.8]],
                 [[x + 0.05, depth / 2, z + 1.3], [x + 1.5, depth / 2, z + 1.3]],
@@ -251,7 +281,7 @@ def house(rng: np.random.Generator, width: float, depth: float, floors: int, det
         parts.append(place(railing(1.0, 0.95), (door_x - 1.1, -1.5, base), 0.0))
     if detached and rng.random() < 0.4:  # a bay window
         x = -np.sign(door_x) * 0.27 * width if door_x else 0.27 * width
-        bay = wall(2.2, -_FOOTING, base + 2.6, [[0.25, 1.95, base + 0.8, base + 2.2]], 0.1)
+        bay = _wall(2.2, -_FOOTING, base + 2.6, [[0.25, 1.95, base + 0.8, base + 2.2]], 0.1)
         parts += [
             shift(bay, x - 1.1, -0.8),
             boxes([[x - 1.1, -0.79, -1], [x + 1.04, -0.79, -1]], [[x - 1.04, 0, base + 2.6], [x + 1.1, 0, base + 2.6]]),
@@ -263,13 +293,13 @@ def house(rng: np.random.Generator, width: float, depth: float, floors: int, det
 
 
 def block(rng: np.random.Generator, width: float, depth: float, floors: int, ground_floor: str, roof: str) -> Part:
-    """A block of flats, offices or shops.
+    """Returns a block of flats, offices or shops.
 
     Args:
-        rng: source of the variety.
-        width: along the street, metres.
-        depth: metres.
-        floors: storeys, the ground floor included.
+        rng: Source of the variety.
+        width: Length along the street, metres.
+        depth: From the front to the back, metres.
+        floors: Number of storeys with the ground floor.
         ground_floor: "shops", "arcade", "passage" or "flats".
         roof: "flat" or "pitched".
     """
@@ -301,16 +331,16 @@ def block(rng: np.random.Generator, width: float, depth: float, floors: int, gro
             keep = np.abs(openings[:, :2].mean(1) - centre) > half + size[0] / 2 + 0.05
             openings = np.concatenate([openings[keep], [[centre - half, centre + half, 0.02, height]]])
             depths = np.concatenate([depths[keep], [deep]])
-        lower.append(wall(length_low, -_FOOTING, first, openings, depths))
+        lower.append(_wall(length_low, -_FOOTING, first, openings, depths))
         openings = row if k == 0 else _windows(length, 2.2 * pitch, size, 0.9)
-        part = wall(length, 0.0, storey, openings, recess)
+        part = _wall(length, 0.0, storey, openings, recess)
         upper.append(merge([part, _trim(openings, rich)]) if rich and len(openings) and k == 0 else part)
     parts.append(_around(lower, width, depth, front_y))
     levels = first + storey * np.arange(floors - 1)
     detailed = levels[levels < _SEEN]
     parts.append(place(_around(upper, width, depth), np.column_stack([np.zeros((len(detailed), 2)), detailed])))
     if len(detailed) < len(levels):
-        bare = [wall(length, levels[len(detailed)], top, [], 0.0) for length in sides]
+        bare = [_wall(length, levels[len(detailed)], top, [], 0.0) for length in sides]
         parts.append(_around(bare, width, depth))
     if front_y:
         h = width / 2
@@ -335,7 +365,7 @@ def block(rng: np.random.Generator, width: float, depth: float, floors: int, gro
         proto = _balcony(min(pitch - 0.3, 3.4), rng.uniform(1.0, 1.5), solid=rng.random() < 0.5)
         x = row[:, :2].mean(1) - width / 2
         pick = np.arange(len(x)) % int(rng.integers(3, 5)) == 1
-        seen = levels[:3]  # higher ones are above any ray
+        seen = levels[:3]  # Rays do not reach higher balconies.
         at = np.stack(np.meshgrid(x[pick], [0.0], seen + 0.05, indexing="ij"), -1).reshape(-1, 3)
         parts.append(place(proto, at))
     if roof == "flat":
@@ -357,27 +387,29 @@ def block(rng: np.random.Generator, width: float, depth: float, floors: int, gro
 
 
 def hall(rng: np.random.Generator, width: float, depth: float, height: float) -> Part:
-    """A warehouse or factory hall: roller doors, some of them open, ribs, a row of high windows, docks or a canopy.
+    """Returns a warehouse or factory hall with roller doors, ribs, high windows, and docks or a canopy.
 
     Args:
-        rng: source of the variety.
-        width: along the street, metres.
-        depth: metres.
-        height: of the walls, metres.
+        rng: Source of the variety.
+        width: Length along the street, metres.
+        depth: From the front to the back, metres.
+        height: Height of the walls, metres.
     """
     doors = _windows(width, rng.uniform(6, 9), (rng.uniform(3.2, 4.2), rng.uniform(3.6, 4.4)), 0.05)
     doors = doors[rng.random(len(doors)) < 0.7]
     dock = rng.random() < 0.5
-    if dock:  # doors a lorry backs up to
+    if dock:  # A lorry backs up to these doors.
         doors[:, 2:] += (1.1, 0.0)
     depths = rng.choice([0.25, 0.5, 7.0], len(doors), p=[0.5, 0.3, 0.2])
     high = _windows(width, 5.0, (3.4, 1.1), height - 1.9)
     if height < 7.5:
         high = high[:0]
-    walls = [wall(width, -_FOOTING, height, np.concatenate([doors, high]), np.append(depths, np.full(len(high), 0.15)))]
+    walls = [
+        _wall(width, -_FOOTING, height, np.concatenate([doors, high]), np.append(depths, np.full(len(high), 0.15)))
+    ]
     for length in (depth, width, depth):
         row = _windows(length, 6.0, (3.0, 1.2), height - 2.4)
-        walls.append(wall(length, -_FOOTING, height, row, 0.15))
+        walls.append(_wall(length, -_FOOTING, height, row, 0.15))
     parts = [_around(walls, width, depth)]
     x = np.arange(-width / 2 + 0.1, width / 2, 5.0)
     free = ~((x[:, None] > doors[:, 0] - width / 2 - 0.3) & (x[:, None] < doors[:, 1] - width / 2 + 0.2)).any(1)
@@ -414,11 +446,11 @@ def hall(rng: np.random.Generator, width: float, depth: float, height: float) ->
 
 
 def barn(rng: np.random.Generator, width: float, depth: float) -> Part:
-    """A barn with a steep roof, a tall gate and slits, or open to the front on posts."""
+    """Returns a barn with a steep roof: with a tall gate and slits, or with posts and an open front; all in metres."""
     height = rng.uniform(3.6, 5.0)
     roof = _gable_roof(width, depth, height, rng.uniform(0.3, 0.42) * depth, 0.5, 0.4)
     if rng.random() < 0.35:
-        back = [wall(w, -_FOOTING, height, [], 0.0) for w in (depth, width, depth)]
+        back = [_wall(w, -_FOOTING, height, [], 0.0) for w in (depth, width, depth)]
         at = [(width / 2, 0, 0), (width / 2, depth, 0), (-width / 2, depth, 0)]
         walls = [place(w, p, (k + 1) * np.pi / 2) for k, (w, p) in enumerate(zip(back, at, strict=True))]
         x = np.linspace(-width / 2 + 0.2, width / 2 - 0.2, max(3, round(width / 4.5)))
@@ -431,15 +463,15 @@ def barn(rng: np.random.Generator, width: float, depth: float) -> Part:
     gate = [[width / 2 - 1.9, width / 2 + 1.9, 0.0, height - 0.3]]
     slits = _windows(width, 3.2, (0.25, 1.0), 1.8)
     slits = slits[np.abs(slits[:, :2].mean(1) - width / 2) > 2.3]
-    front = wall(
+    front = _wall(
         width, -_FOOTING, height, np.concatenate([gate, slits]), [rng.choice([0.3, 5.0]), *([0.3] * len(slits))]
     )
-    others = [wall(w, -_FOOTING, height, _windows(w, 3.4, (0.25, 1.0), 1.8), 0.3) for w in (depth, width, depth)]
+    others = [_wall(w, -_FOOTING, height, _windows(w, 3.4, (0.25, 1.0), 1.8), 0.3) for w in (depth, width, depth)]
     return merge([_around([front, *others], width, depth), roof])
 
 
 def church(rng: np.random.Generator) -> Part:
-    """A church: a tower with a spire over the porch, a nave behind it with buttresses and tall windows."""
+    """Returns a church: a tower with a porch and a spire, and behind it a nave with buttresses and tall windows."""
     side, width, depth = rng.uniform(6.0, 7.5), rng.uniform(11, 14), rng.uniform(24, 30)
     top, height = rng.uniform(17, 22), rng.uniform(8.0, 9.5)
     belfry = [[side / 2 - 1.0, side / 2 + 1.0, top - 4.5, top - 1.5]]
@@ -447,7 +479,7 @@ def church(rng: np.random.Generator) -> Part:
     slit = [[side / 2 - 0.3, side / 2 + 0.3, 7.0, 9.5]]
     tower = _around(
         [
-            wall(
+            _wall(
                 side,
                 -_FOOTING,
                 top,
@@ -462,7 +494,7 @@ def church(rng: np.random.Generator) -> Part:
     spire = tubes([0, side / 2, top], [0, side / 2, top + 14], side / 2 * 1.35, 0.05, sides=8)
     windows = _windows(depth, 4.2, (1.3, 4.2), 2.2)
     nave = [
-        wall(w, -_FOOTING, height, windows if k % 2 else [], 0.5) for k, w in enumerate((width, depth, width, depth))
+        _wall(w, -_FOOTING, height, windows if k % 2 else [], 0.5) for k, w in enumerate((width, depth, width, depth))
     ]
     roof = place(_gable_roof(depth, width, height, 0.55 * width, 0.4, 0.2), (width / 2, depth / 2, 0), np.pi / 2)
     y = np.linspace(0.3, depth - 0.9, len(windows) + 1)
@@ -475,14 +507,14 @@ def church(rng: np.random.Generator) -> Part:
 
 
 def tower(rng: np.random.Generator, width: float, depth: float, floors: int, ground_floor: str) -> Part:
-    """A tower that stands back on a podium of shops; above what rays reach it is a shaft with bands.
+    """Returns an office tower: a shaft with bands and no windows, set back on a podium of shops.
 
     Args:
-        rng: source of the variety.
-        width: along the street, metres.
-        depth: metres.
-        floors: storeys in all.
-        ground_floor: as for `block`.
+        rng: Source of the variety.
+        width: Length along the street, metres.
+        depth: From the front to the back, metres.
+        floors: Number of storeys in all.
+        ground_floor: As for `block`.
     """
     podium = block(rng, width, depth, int(rng.integers(2, 6)), ground_floor, "flat")
     base = float(podium.vertices[:, 2].max())

@@ -1,10 +1,14 @@
-"""What stands along a street. Prototypes stand at the origin on z = 0; their front or arm points along +x, metres."""
+"""Street furniture and fences.
+
+Each piece stands at the origin on z = 0, in metres; its front or arm points along +x. Copies are placed in the town.
+"""
 
 import numpy as np
 
-from ilnet.world.towns.parts import Part, boxes, merge, place, polyline_tubes, tubes
+from ilnet.world.towns.parts import Panel, Part, boxes, merge, place, polyline_tubes, tubes
 
 __all__ = [
+    "POLE_HOOKS",
     "bench",
     "bin_",
     "bollard",
@@ -21,13 +25,12 @@ __all__ = [
 ]
 
 
-def _ring(radius: float, sides: int, x: float, z: float, y: float = 0.0) -> np.ndarray:
-    turn = 2 * np.pi * (np.arange(sides) + 0.5) / sides
-    return np.stack([np.full(sides, x), y + radius * np.cos(turn), z + radius * np.sin(turn)], axis=1)
+# Where the wires of a power pole hang: y and z [m].
+POLE_HOOKS = ((-1.0, 8.0), (0.35, 8.0), (1.0, 8.0))
 
 
 def lamp(height: float, arm: float) -> Part:
-    """A lamp post whose arm reaches out over +x."""
+    """Returns a lamp post; `height` of the lamp and reach of its `arm` along +x in metres."""
     bend = np.array([[0, 0, height - 0.6], [0.25 * arm, 0, height - 0.12], [arm, 0, height]])
     parts = [
         tubes([0, 0, -0.3], [0, 0, 1.1], 0.1, sides=8),
@@ -39,7 +42,12 @@ def lamp(height: float, arm: float) -> Part:
 
 
 def sign(shape: int, height: float = 2.4) -> Part:
-    """A traffic sign on a thin pole, facing +x: a disc, a triangle, a rectangle or two plates (shape 0 to 3)."""
+    """Returns a traffic sign that faces +x on a thin pole.
+
+    Args:
+        shape: 0 for a disc, 1 for a triangle, 2 for a rectangle, 3 for a disc above a plate.
+        height: Height of its middle, metres.
+    """
     parts = [tubes([0, 0, -0.3], [0, 0, height + 0.35], 0.03, sides=6)]
     if shape in (0, 3):
         parts.append(tubes([0.035, 0, height], [0.05, 0, height], 0.31, sides=16))
@@ -53,10 +61,10 @@ def sign(shape: int, height: float = 2.4) -> Part:
 
 
 def traffic_light(arm: float) -> Part:
-    """Signal heads on a pole and, over the lanes, on an arm along +x; the heads face +y.
+    """Returns a traffic light: signal heads that face +y, on a pole and on an arm along +x over the lanes.
 
     Args:
-        arm: reach of the arm, metres.
+        arm: Reach of the arm, metres.
     """
     low = np.array([[-0.16, 0.07, 2.4], [arm - 0.16, 0.07, 5.3], [0.5 * arm - 0.16, 0.07, 5.25]])
     lens = low[:, None] + np.array([[0.16, 0.22, 0.17 + 0.28 * k] for k in range(3)])
@@ -72,7 +80,7 @@ def traffic_light(arm: float) -> Part:
 
 
 def bollard() -> Part:
-    """A bollard, 0.9 m high."""
+    """Returns a bollard, 0.9 m high."""
     return merge(
         [
             tubes([0, 0, -0.2], [0, 0, 0.85], 0.06, 0.055, sides=8),
@@ -82,7 +90,7 @@ def bollard() -> Part:
 
 
 def bench() -> Part:
-    """A slatted bench along y, facing +x."""
+    """Returns a slatted bench along y that faces +x."""
     slats = boxes(
         [[-0.2 + 0.12 * k, -0.9, 0.43] for k in range(4)]
         + [[-0.27 - 0.03 * k, -0.9, 0.55 + 0.14 * k] for k in range(3)],
@@ -95,7 +103,7 @@ def bench() -> Part:
 
 
 def bin_(wheeled: bool) -> Part:
-    """A litter bin, or a wheeled one with a lid."""
+    """Returns a wheeled bin with a lid, or else a litter bin."""
     if not wheeled:
         return merge(
             [
@@ -108,33 +116,33 @@ def bin_(wheeled: bool) -> Part:
 
 
 def cabinet() -> Part:
-    """A cabinet of the telephone or power company."""
+    """Returns a cabinet for telephone or power lines."""
     return merge([boxes([-0.2, -0.6, 0], [0.2, 0.6, 1.25]), boxes([-0.24, -0.64, 1.25], [0.24, 0.64, 1.3])])
 
 
 def cycle_hoops() -> Part:
-    """Five hoops to lean bicycles against, in a row along y."""
+    """Returns five hoops in a row along y to lean bicycles against."""
     hoop = [[-0.35, 0, 0], [-0.35, 0, 0.65], [-0.25, 0, 0.8], [0.25, 0, 0.8], [0.35, 0, 0.65], [0.35, 0, 0]]
     return place(polyline_tubes(hoop, 0.025, sides=5), [[0, y, 0] for y in (-1.6, -0.8, 0, 0.8, 1.6)])
 
 
 def pole() -> Part:
-    """A wooden power pole with a crossarm along y and insulators."""
+    """Returns a wooden power pole with a crossarm along y and insulators; wires hang at `POLE_HOOKS`."""
     arms = boxes([[-0.05, -1.1, 7.7], [-0.05, -0.8, 7.0]], [[0.05, 1.1, 7.82], [0.05, 0.8, 7.1]])
-    pins = tubes([[0, y, 7.82] for y in (-1, 0.35, 1)], [[0, y, 8.0] for y in (-1, 0.35, 1)], 0.04, sides=5)
+    pins = tubes([[0, y, 7.82] for y, _ in POLE_HOOKS], [[0, y, z] for y, z in POLE_HOOKS], 0.04, sides=5)
     return merge([tubes([0, 0, -0.5], [0, 0, 8.3], 0.15, 0.1, sides=8), arms, pins])
 
 
 def wire(start: np.ndarray, end: np.ndarray, sag: float, radius: float = 0.02) -> Part:
-    """A wire hanging between two points (3,)."""
+    """Returns a wire that hangs between two points (3,) with a sag; all in metres."""
     t = np.linspace(0, 1, 10)[:, None]
     line = start + t * (end - start)
     line[:, 2] -= sag * (4 * t * (1 - t))[:, 0]
     return polyline_tubes(line, radius)
 
 
-def fence(length: float, height: float = 1.0, gap: float = 0.16) -> Part:
-    """A picket fence along +x from the origin."""
+def fence(length: float, height: float, gap: float) -> Panel:
+    """Returns a picket fence; `gap` is the distance from one picket to the next, metres."""
     count = max(2, int(length / gap))
     x = np.linspace(0, length - 0.08, count)
     zero = np.zeros(count)
@@ -146,11 +154,11 @@ def fence(length: float, height: float = 1.0, gap: float = 0.16) -> Part:
         np.column_stack([posts_x + 0.1, 0 * posts_x + 0.16, 0 * posts_x + height]),
     )
     rails = boxes([[0, 0.02, 0.25], [0, 0.02, height - 0.25]], [[length, 0.06, 0.33], [length, 0.06, height - 0.17]])
-    return merge([pickets, posts, rails])
+    return Panel(merge([pickets, posts, rails]), length)
 
 
 def railing(length: float, height: float = 1.05, gap: float = 0.14) -> Part:
-    """A metal railing along +x from the origin: upright bars between two rails."""
+    """Returns a metal railing along +x from the origin: bars `gap` metres apart between two rails."""
     count = max(2, round(length / gap) + 1)
     x = np.linspace(0, length, count)
     zero = np.zeros(count)
@@ -162,7 +170,7 @@ def railing(length: float, height: float = 1.05, gap: float = 0.14) -> Part:
 
 
 def bus_shelter() -> Part:
-    """A glazed bus shelter along y, open towards +x, 4 m long."""
+    """Returns a glazed bus shelter, 4 m long along y and open towards +x."""
     glass = boxes([[-0.75, -2, 0.15], [-0.75, -2, 0.15]], [[-0.72, 2, 2.2], [0.3, -1.97, 2.2]])
     roof = boxes([-0.85, -2.1, 2.35], [0.75, 2.1, 2.47])
     posts = tubes(

@@ -1,4 +1,4 @@
-"""Triangle primitives and their instancing. Everything here is (vertices, triangles) in metres, z up."""
+"""Pieces of mesh in metres, z up: primitives such as boxes and tubes, and functions that copy, move and join them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,7 +6,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["EMPTY", "Part", "boxes", "loft", "merge", "place", "polyline_tubes", "quads", "raster", "shift", "tubes"]
+__all__ = [
+    "EMPTY",
+    "Panel",
+    "Part",
+    "boxes",
+    "loft",
+    "merge",
+    "place",
+    "polyline_tubes",
+    "quads",
+    "raster",
+    "shift",
+    "tubes",
+]
 
 
 class Part(NamedTuple):
@@ -16,11 +29,20 @@ class Part(NamedTuple):
     triangles: np.ndarray
 
 
+class Panel(NamedTuple):
+    """A piece of a fence, wall or hedge, to be repeated along a path."""
+
+    part: Part
+    """Runs along +x from the origin."""
+    length: float
+    """Distance from one panel to the next, metres."""
+
+
 EMPTY = Part(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
 
 
 def merge(parts: Sequence[Part]) -> Part:
-    """Join parts into one."""
+    """Returns several parts as one."""
     if not parts:
         return EMPTY
     starts = np.cumsum([0, *[len(p.vertices) for p in parts[:-1]]])
@@ -29,20 +51,20 @@ def merge(parts: Sequence[Part]) -> Part:
 
 
 def _repeat(vertices: np.ndarray, triangles: np.ndarray) -> Part:
-    """N copies (N, K, 3) of one topology (F, 3)."""
+    """Returns N pieces with vertices (N, K, 3) that all have the same triangles (F, 3) as one part."""
     count, size = vertices.shape[:2]
     offsets = size * np.arange(count)[:, None, None]
     return Part(vertices.reshape(-1, 3), (triangles[None] + offsets).reshape(-1, 3))
 
 
 def place(part: Part, position: ArrayLike, yaw: ArrayLike = 0.0, scale: ArrayLike = 1.0) -> Part:
-    """Instance a part: scale, turn about z, then move.
+    """Returns copies of a part, each scaled, then turned about z, then moved.
 
     Args:
-        part: what to copy.
-        position: (3,) or (N, 3), metres.
-        yaw: scalar or (N,), rad counter-clockwise.
-        scale: scalar, (N,) or (N, 3).
+        part: What to copy.
+        position: (3,) or (N, 3) where the origin of each copy goes, metres.
+        yaw: Scalar or (N,), rad counter-clockwise.
+        scale: Scalar, (N,), or (N, 3) along the part's own axes.
     """
     position = np.atleast_2d(np.asarray(position, dtype=np.float64))
     count = len(position)
@@ -57,12 +79,12 @@ def place(part: Part, position: ArrayLike, yaw: ArrayLike = 0.0, scale: ArrayLik
 
 
 def shift(part: Part, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Part:
-    """Move a part."""
+    """Returns a part moved by (x, y, z) metres."""
     return Part(part.vertices + np.array([x, y, z]), part.triangles)
 
 
 def quads(corners: ArrayLike) -> Part:
-    """Flat four-sided faces from corners (N, 4, 3) given around each face."""
+    """Returns flat four-sided faces; corners (N, 4, 3) [m] go around each face."""
     corners = np.asarray(corners, dtype=np.float64).reshape(-1, 4, 3)
     return _repeat(corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
@@ -72,7 +94,13 @@ _BOX_FACES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [
 
 
 def boxes(low: ArrayLike, high: ArrayLike, ends: bool = True) -> Part:
-    """Axis-aligned boxes between corners low and high, each (3,) or (N, 3); without `ends`, no top and bottom."""
+    """Returns axis-aligned boxes.
+
+    Args:
+        low: (3,) or (N, 3) corners with the smallest coordinates, metres.
+        high: (3,) or (N, 3) opposite corners, metres.
+        ends: Whether the boxes have a top and a bottom.
+    """
     low, high = np.broadcast_arrays(np.atleast_2d(np.asarray(low, float)), np.atleast_2d(np.asarray(high, float)))
     corners = low[:, None] + _BOX * (high - low)[:, None]
     faces = _BOX_FACES if ends else _BOX_FACES[:4]
@@ -87,15 +115,15 @@ def tubes(
     sides: int = 4,
     caps: bool = True,
 ) -> Part:
-    """Tapered prisms.
+    """Returns tapered prisms.
 
     Args:
-        start: (N, 3) or (3,), metres.
-        end: as start.
-        radius: at the start, scalar or (N,), metres.
-        end_radius: at the end; the same as radius when left out.
-        sides: number of sides of the prism.
-        caps: whether the ends are closed; thin bars do without.
+        start: (3,) or (N, 3) start of each axis, metres.
+        end: (3,) or (N, 3) end of each axis, metres.
+        radius: Scalar or (N,) radius at the start, metres.
+        end_radius: Scalar or (N,) radius at the end, metres; by default the same as at the start.
+        sides: Number of sides of each prism.
+        caps: Whether the ends are closed. Thin bars do not need it.
     """
     start, end = np.broadcast_arrays(np.atleast_2d(np.asarray(start, float)), np.atleast_2d(np.asarray(end, float)))
     count = len(start)
@@ -122,13 +150,13 @@ def tubes(
 
 
 def polyline_tubes(points: ArrayLike, radius: float, sides: int = 3) -> Part:
-    """A thin prism along a polyline (N, 3)."""
+    """Returns open prisms along a polyline (N, 3) [m], all of one radius [m]."""
     points = np.asarray(points, dtype=np.float64)
     return tubes(points[:-1], points[1:], radius, sides=sides, caps=False)
 
 
 def loft(rings: np.ndarray) -> Part:
-    """The closed skin over rings (M, K, 3), with fans over the first and the last."""
+    """Returns the closed skin over M rings of K points (M, K, 3) [m], with fans over the first and the last ring."""
     m, k = rings.shape[:2]
     a = (np.arange(m - 1)[:, None] * k + np.arange(k)).ravel()
     b = (np.arange(m - 1)[:, None] * k + (np.arange(k) + 1) % k).ravel()
@@ -139,5 +167,8 @@ def loft(rings: np.ndarray) -> Part:
 
 
 def raster(metres: np.ndarray) -> np.ndarray:
-    """Returns an array rounded to 1/1024 and as float32, so that machines which differ in last digits agree."""
+    """Returns an array as float32, rounded to multiples of 1/1024.
+
+    Machines whose arithmetic differs in the last digits then give the same values.
+    """
     return (np.round(metres * 1024) / 1024).astype(np.float32)

@@ -1,4 +1,4 @@
-"""How a plan becomes a town: ground, landmarks, lots along the streets, furniture, fields."""
+"""How a plan becomes a town: ground, landmarks, lots, dressing, in this order."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,45 +9,46 @@ from ilnet.world.towns.dressing import dress_street, plant_fields
 from ilnet.world.towns.frontage import build_lots
 from ilnet.world.towns.plants import Greens, greenery
 from ilnet.world.towns.site import Site
-from ilnet.world.towns.streets import KERB, Ground, Street
-from ilnet.world.towns.town import Town
+from ilnet.world.towns.streets import KERB_HEIGHT, Ground, Street
+from ilnet.world.towns.town import LIDAR_REACH, Town
 
-__all__ = ["Plan", "raise_town"]
+__all__ = ["Plan", "build_town"]
 
-_MARGIN = 95.0  # metres of land around the town: a little more than a LiDAR's reach
+# The ground ends beyond the reach of a LiDAR on the outermost street [m].
+_MARGIN = LIDAR_REACH + 10.0
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What tells one town from another.
+    """The streets, landmarks and slopes that tell one town from another.
 
     Attributes:
-        streets: draws the streets by their names.
-        landmarks: builds what stands nowhere else, before the lots along the streets are filled.
-        steepness: rise over run of the steepest slope, about.
-        kerb: metres.
+        streets: Draws the streets; its result maps their names to them.
+        landmarks: Builds what only this town has. It runs before the lots along the streets are filled.
+        steepness: Rise over run of the steepest slope, approximately.
+        kerb_height: Height of pavements and lots above the carriageway, metres.
     """
 
     streets: Callable[[np.random.Generator], dict[str, Street]]
     landmarks: Callable[[Site, dict[str, Street], Greens, np.random.Generator], None]
     steepness: float = 0.055
-    kerb: float = KERB
+    kerb_height: float = KERB_HEIGHT
 
 
-def raise_town(plan: Plan, name: str, seed: int, waypoints: int) -> Town:
-    """Returns the town of a plan; its name and seed decide the draw.
+def build_town(plan: Plan, name: str, seed: int, waypoints: int) -> Town:
+    """Returns the town of a plan. The number in its name and the seed decide every random choice.
 
     Args:
-        plan: what to build.
-        name: ends in the town's two-digit number.
-        seed: another seed gives another town of the same character.
-        waypoints: how many to keep at most.
+        plan: What to build.
+        name: Name of the town; its last two characters are its number.
+        seed: Another seed gives another town of the same character.
+        waypoints: Largest number of waypoints to keep.
     """
     rng = np.random.default_rng([int(name[-2:]), seed])
     streets = plan.streets(rng)
     lines = list(streets.values())
-    reach = max(np.abs(s.core).max() for s in lines)
-    site = Site(Ground(lines, reach + _MARGIN, rng, plan.steepness, plan.kerb))
+    reach = max(np.abs(s.line_in_town).max() for s in lines)
+    site = Site(Ground(lines, reach + _MARGIN, rng, plan.steepness, plan.kerb_height))
     greens = greenery(rng)
     plan.landmarks(site, streets, greens, rng)
     for street in lines:

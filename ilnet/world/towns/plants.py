@@ -1,20 +1,24 @@
-"""Trees, bushes and hedges with leaves that let some rays through. Prototypes stand at the origin, metres."""
+"""Trees, bushes and hedges, whose leaves let some rays through.
+
+Each plant stands at the origin on z = 0, in metres; copies of it are placed in the town.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from ilnet.world.towns.parts import Part, boxes, merge, tubes
+from ilnet.world.towns.parts import Panel, Part, boxes, merge, tubes
 
 __all__ = ["Greens", "greenery", "hedge"]
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Returns vectors (..., 3) scaled to length 1."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
 
 
 def _leaves(centres: np.ndarray, size: tuple[float, float], rng: np.random.Generator) -> Part:
-    """One triangle of random attitude per centre (N, 3); size is the range of its side, metres."""
+    """Returns one triangle in a random attitude at each centre (N, 3) [m]; `size` is the range of its side [m]."""
     count = len(centres)
     u = _unit(rng.standard_normal((count, 3)))
     w = _unit(np.cross(u, rng.standard_normal((count, 3))))
@@ -27,14 +31,14 @@ def _leaves(centres: np.ndarray, size: tuple[float, float], rng: np.random.Gener
 def _branches(
     height: float, crown: float, clear: float, twigs: int, rng: np.random.Generator
 ) -> tuple[Part, np.ndarray]:
-    """Trunk, boughs and twigs, and the twigs' points (N, 3).
+    """Returns trunk, boughs and twigs, and the points (N, 3) [m] around which leaves grow.
 
     Args:
-        height: of the whole tree, metres.
-        crown: radius of the crown, metres.
-        clear: height of the lowest bough, metres.
-        twigs: number of twigs on each bough.
-        rng: source of the shape.
+        height: Height of the whole tree, metres.
+        crown: Radius of the crown, metres.
+        clear: Height of the lowest bough, metres.
+        twigs: Number of twigs on each bough.
+        rng: Source of the shape.
     """
     knots = np.linspace(0, 0.8 * height, 6)
     lean = np.cumsum(rng.normal(0, 0.12, (6, 2)), axis=0) * (knots / height)[:, None]
@@ -45,7 +49,7 @@ def _branches(
     count = 9
     z = np.sort(rng.uniform(clear, 0.78 * height, count))
     root = np.column_stack([np.interp(z, knots, lean[:, k]) for k in range(2)] + [z])
-    turn = 2.4 * np.arange(count) + rng.uniform(-0.4, 0.4, count)  # the golden angle spreads boughs evenly
+    turn = 2.4 * np.arange(count) + rng.uniform(-0.4, 0.4, count)  # The golden angle spreads boughs evenly.
     level = (z - clear) / (height - clear)
     reach = crown * np.sqrt(np.clip(1 - (2 * level - 0.75) ** 2 * 0.6, 0.15, 1)) * rng.uniform(0.65, 0.95, count)
     rise = reach * rng.uniform(0.3, 0.7, count)
@@ -72,16 +76,16 @@ def _tree(
     size: tuple[float, float],
     twigs: int = 4,
 ) -> Part:
-    """A broad-leaved tree; bare when `leaves` is 0.
+    """Returns a broad-leaved tree.
 
     Args:
-        rng: source of the shape.
-        height: metres.
-        crown: radius of the crown, metres.
-        clear: height below which nothing but the trunk stands, metres.
-        leaves: number of leaf triangles.
-        size: range of a leaf's side, metres.
-        twigs: number of twigs on each bough.
+        rng: Source of the shape.
+        height: Height of the tree, metres.
+        crown: Radius of the crown, metres.
+        clear: Height up to which there is only the trunk, metres.
+        leaves: Number of leaf triangles; 0 for a bare tree.
+        size: Range of a leaf's side, metres.
+        twigs: Number of twigs on each bough.
     """
     wood, tips = _branches(height, crown, clear + 0.3, twigs, rng)
     if not leaves:
@@ -92,7 +96,7 @@ def _tree(
 
 
 def _conifer(rng: np.random.Generator, height: float, leaves: int) -> Part:
-    """A conifer: whorls of drooping branches, needles as slim triangles."""
+    """Returns a conifer: whorls of drooping branches with triangles as needles."""
     z = np.repeat(np.linspace(0.12, 0.95, 14), 6) * height
     turn = rng.uniform(0, 2 * np.pi, len(z))
     reach = (1 - z / height) * 0.24 * height + 0.15
@@ -105,7 +109,7 @@ def _conifer(rng: np.random.Generator, height: float, leaves: int) -> Part:
 
 
 def _bush(rng: np.random.Generator, radius: float, leaves: int) -> Part:
-    """A round bush with a few stems."""
+    """Returns a round bush with a few stems."""
     way = _unit(rng.standard_normal((leaves, 3)))
     way[:, 2] = np.abs(way[:, 2])
     at = way * (radius * rng.uniform(0.55, 1.0, leaves) ** 0.5)[:, None] * (1, 1, 1.1)
@@ -113,36 +117,36 @@ def _bush(rng: np.random.Generator, radius: float, leaves: int) -> Part:
     return merge([tubes(np.zeros((7, 3)), tips, 0.025, 0.01, sides=3, caps=False), _leaves(at, (0.12, 0.3), rng)])
 
 
-def hedge(rng: np.random.Generator, length: float, height: float, width: float) -> Part:
-    """A clipped hedge along +x from the origin: a dense core with leaves standing out of it."""
+def hedge(rng: np.random.Generator, length: float, height: float, width: float) -> Panel:
+    """Returns a clipped hedge: a dense core with leaves standing out of it; lengths in metres."""
     core = boxes([0.0, -width / 2 + 0.14, -0.3], [length, width / 2 - 0.14, height - 0.14])
     count = int(length * 38)
     face = rng.uniform(0, 2 * height + width, count)
     y = np.where(face < height, -width / 2, np.where(face > height + width, width / 2, face - height - width / 2))
     z = np.where(face < height, face, np.where(face > height + width, face - height - width, height))
     at = np.column_stack([rng.uniform(0, length, count), y, z]) + rng.normal(0, 0.05, (count, 3))
-    return merge([core, _leaves(at, (0.14, 0.32), rng)])
+    return Panel(merge([core, _leaves(at, (0.14, 0.32), rng)]), length)
 
 
 @dataclass(frozen=True)
 class Greens:
-    """A town's prototypes of plants.
+    """The plants that a town copies.
 
     Attributes:
-        kinds: those of the street ("tall"), of gardens ("small", "conifer", "bush"), of the distance ("far"), and trees
-            without leaves ("bare").
+        kinds: Plants by kind: street trees ("tall"), garden plants ("small", "conifer", "bush"), trees in the distance
+            ("far"), and trees without leaves ("bare").
     """
 
     kinds: dict[str, list[Part]]
 
     def pick(self, rng: np.random.Generator, *kinds: str) -> Part:
-        """Returns a plant of one of some kinds."""
+        """Returns a random plant of the given kinds."""
         plants = [plant for kind in kinds for plant in self.kinds[kind]]
         return plants[int(rng.integers(0, len(plants)))]
 
 
 def greenery(rng: np.random.Generator) -> Greens:
-    """Grows the prototypes of a town."""
+    """Returns the plants of a town."""
     return Greens(
         {
             "tall": [

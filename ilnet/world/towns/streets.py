@@ -1,4 +1,4 @@
-"""Streets as centrelines, and the ground under the whole town: carriageways, kerbs, lots and fields."""
+"""Streets as centrelines, and the ground of the whole town: carriageways, kerbs, lots and fields."""
 
 from dataclasses import dataclass, replace
 
@@ -6,18 +6,18 @@ import numpy as np
 
 from ilnet.world.towns.parts import Part, merge
 
-__all__ = ["KERB", "Draft", "Ground", "Street", "inside"]
+__all__ = ["KERB_HEIGHT", "Draft", "Ground", "Street", "inside"]
 
-KERB = 0.12
-_CELL = 4  # coarse ground cell [m]; the kerb is cut on a 1 m grid nested in it
-_FAR = 18.0  # distances to the kerb are kept up to here [m]
-_SPACING = 2.0  # between the points of a centreline [m]
-_TAIL = 150.0  # a street that leaves the town goes on beyond a LiDAR's reach [m]
-_CORNER = 6.0  # blend of two kerb lines [m]; about a 5 m corner radius
+KERB_HEIGHT = 0.12
+_CELL = 4  # Side of a coarse cell of the ground [m]. The kerb is cut on a grid of 1 m nested in it.
+_FAR = 18.0  # Largest distance from the kerb that is kept [m].
+_SPACING = 2.0  # Distance between the points of a centreline [m].
+_TAIL = 150.0  # A street that leaves the town goes on so much longer, beyond a LiDAR's reach [m].
+_CORNER = 6.0  # Where two kerb lines meet, they blend over this distance [m]; the corner's radius is about 5 m.
 
 
-def _spline(points: np.ndarray, spacing: float = _SPACING, closed: bool = False) -> np.ndarray:
-    """A Catmull-Rom curve through points (N, 2), resampled to even steps of about `spacing` metres."""
+def _spline(points: np.ndarray, closed: bool = False) -> np.ndarray:
+    """Returns a Catmull-Rom curve through points (N, 2) [m], resampled to even steps of about `_SPACING`."""
     before, after = 2 * points[:1] - points[1:2], 2 * points[-1:] - points[-2:-1]
     if closed:
         before, after = points[-2:-1], points[1:2]
@@ -27,7 +27,7 @@ def _spline(points: np.ndarray, spacing: float = _SPACING, closed: bool = False)
     curve = p1 + 0.5 * t * (p2 - p0 + t * (2 * p0 - 5 * p1 + 4 * p2 - p3 + t * (3 * (p1 - p2) + p3 - p0)))
     dense = np.concatenate([curve.reshape(-1, 2), points[-1:]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(dense, axis=0), axis=1))])
-    even = np.linspace(0, along[-1], max(2, round(along[-1] / spacing) + 1))
+    even = np.linspace(0, along[-1], max(2, round(along[-1] / _SPACING) + 1))
     return np.stack([np.interp(even, along, dense[:, k]) for k in range(2)], axis=1)
 
 
@@ -37,19 +37,20 @@ class Street:
 
     Attributes:
         line: (N, 2) centreline at even steps, metres.
-        half: from the centreline to the kerb, metres.
-        lanes: lane centres to the right of the centreline, metres; the other direction mirrors them.
-        frontage: what stands along it, a key the town gives meaning to.
-        pavement: width of the pavement, metres.
-        parking: whether cars park along the kerb.
-        median: half the width of a raised median, metres; 0 is none.
-        oneway: whether all lanes run along the line; then they may lie left of it (negative).
-        sides: on which sides something stands along it: 1 right, -1 left.
-        tails: metres at the start and the end of the line that are road, but without waypoints and lots.
+        half_width: Distance from the centreline to the kerb, metres.
+        lanes: Lane centres as distances to the right of the centreline, metres. The other direction mirrors them.
+        frontage: The kind of buildings along it: a key of the styles in `frontage.py`, or another word for none.
+        pavement: Width of the pavement, metres.
+        parking: Whether cars park along the kerb.
+        median: Half the width of a raised median, metres; 0 for no median.
+        oneway: Whether all lanes run along the line. Lanes may then lie to the left of it (negative).
+        sides: The sides that have buildings and furniture: 1 is right, -1 is left.
+        tails: Lengths at the start and at the end of the line that lead out of the town, metres. They are road without
+            waypoints or lots.
     """
 
     line: np.ndarray
-    half: float
+    half_width: float
     lanes: tuple[float, ...]
     frontage: str
     pavement: float = 2.2
@@ -61,22 +62,30 @@ class Street:
 
     @property
     def ways(self) -> tuple[int, ...]:
-        """Directions of travel: 1 along the line, -1 against it."""
+        """The directions of travel: 1 along the line, -1 against it."""
         return (1,) if self.oneway else (1, -1)
 
     @property
-    def core(self) -> np.ndarray:
-        """The line (M, 2) without its tails."""
+    def line_in_town(self) -> np.ndarray:
+        """The centreline (M, 2) without its tails, metres."""
         first, last = (round(t / _SPACING) for t in self.tails)
         return self.line[first : len(self.line) - last]
 
     @property
     def length(self) -> float:
-        """Length of the centreline, metres."""
+        """The length of the centreline with its tails, metres."""
         return float(np.linalg.norm(np.diff(self.line, axis=0), axis=1).sum())
 
     def at(self, along: np.ndarray, right: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-        """Points (M, 2) at arc length `along`, `right` metres to the right, and the street's heading there (M,) rad."""
+        """Returns points beside the centreline and the street's headings there.
+
+        Args:
+            along: Scalar or (M,) arc lengths from the start of the line, metres.
+            right: Scalar or (M,) distances to the right of the centreline, metres.
+
+        Returns:
+            Points (M, 2) [m] and headings (M,) [rad counter-clockwise from +x].
+        """
         s = np.linspace(0, self.length, len(self.line))
         along = np.atleast_1d(np.asarray(along, dtype=np.float64))
         tangent = np.gradient(self.line, axis=0)
@@ -89,16 +98,29 @@ class Street:
 
 
 class Draft:
-    """The lines of a plan: each wobbles a little, and in the end all are mirrored and turned alike."""
+    """Draws the centrelines of a plan.
+
+    Each line strays a little from its plan. In the end all are mirrored and turned together.
+    """
 
     def __init__(self, rng: np.random.Generator, wobble: float = 14.0):
-        """Draw which way the town will lie; `wobble` metres is how far points may stray from the plan."""
+        """Draws how the town will be mirrored and turned.
+
+        Args:
+            rng: Source of the variety.
+            wobble: How far points may stray from the plan along each axis, metres.
+        """
         self._rng, self._wobble = rng, wobble
         self._mirror = rng.choice([-1.0, 1.0])
         self._turn = rng.uniform(-0.2, 0.2) + np.pi / 2 * int(rng.integers(0, 4))
 
     def curve(self, points: list[tuple[float, float]], fixed: str = "") -> np.ndarray:
-        """Returns a line through points; `fixed` says which ends ("s", "e") lie on another street and stay."""
+        """Returns a line (N, 2) [m] through points that stray.
+
+        Args:
+            points: x and y in the frame of the plan, metres.
+            fixed: The ends that lie on another street and do not stray: "s" the start, "e" the end, "se" both.
+        """
         at = np.array(points, dtype=np.float64)
         wobble = self._rng.uniform(-self._wobble, self._wobble, at.shape)
         if "s" in fixed:
@@ -109,13 +131,13 @@ class Draft:
 
     @staticmethod
     def on(line: np.ndarray, share: float) -> tuple[float, float]:
-        """Returns the point at a share of a line's length."""
+        """Returns the point at a share (0 to 1) of a line's length."""
         x, y = line[round(share * (len(line) - 1))]
         return float(x), float(y)
 
     @staticmethod
     def beside(line: np.ndarray, share: float, left: float) -> tuple[float, float]:
-        """Returns the point `left` metres to the left of a line at a share of its length."""
+        """Returns the point `left` metres to the left of a line at a share (0 to 1) of its length."""
         k = min(max(round(share * (len(line) - 1)), 1), len(line) - 2)
         way = line[k + 1] - line[k - 1]
         x, y = line[k] + left * np.array([-way[1], way[0]]) / np.hypot(*way)
@@ -123,11 +145,11 @@ class Draft:
 
     @staticmethod
     def straight(points: list[tuple[float, float]]) -> np.ndarray:
-        """Returns a line through points that do not wobble."""
+        """Returns a line through points that do not stray."""
         return _spline(np.array(points, dtype=np.float64))
 
     def closed(self, points: list[tuple[float, float]]) -> np.ndarray:
-        """Returns a closed line through points, given counter-clockwise."""
+        """Returns a closed line through points that stray a little; they go counter-clockwise."""
         at = np.array(points, dtype=np.float64)
         at += self._rng.uniform(-0.2, 0.2, at.shape) * self._wobble
         return _spline(np.concatenate([at, at[:1]]), closed=True)
@@ -141,7 +163,10 @@ class Draft:
         return line
 
     def settle(self, streets: dict[str, Street]) -> dict[str, Street]:
-        """Returns the streets in the town's frame; ends that meet no other street lead out of the town."""
+        """Returns the streets, mirrored and turned into the town's frame.
+
+        An end that meets no other street gets a tail, which leads out of the town.
+        """
         settled = {}
         for name, street in streets.items():
             others = np.concatenate([s.line for other, s in streets.items() if other != name])
@@ -157,14 +182,14 @@ class Draft:
             y = self._mirror * line[:, 1]
             cos, sin = np.cos(self._turn), np.sin(self._turn)
             line = np.column_stack([cos * line[:, 0] - sin * y, sin * line[:, 0] + cos * y])
-            if street.oneway and self._mirror < 0:  # traffic keeps to the right in the mirror, too
+            if street.oneway and self._mirror < 0:  # Traffic keeps to the right in a mirrored town as well.
                 line, tails = line[::-1], tails[::-1]
             settled[name] = replace(street, line=line, tails=(tails[0], tails[1]))
         return settled
 
 
 def inside(line: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Returns whether points (N, 2) lie inside a closed line (M, 2)."""
+    """Returns which of points (N, 2) lie inside a closed line (M, 2), as (N,) bool."""
     x, y = np.asarray(xy, dtype=np.float64).T[..., None]
     (x0, y0), (x1, y1) = line[:-1].T, line[1:].T
     rising = (y0 <= y) != (y1 <= y)
@@ -173,7 +198,7 @@ def inside(line: np.ndarray, xy: np.ndarray) -> np.ndarray:
 
 
 def _segment_distance(xy: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Distance of points (N, 2) from a polyline (M, 2), metres."""
+    """Returns the distances (N,) [m] of points (N, 2) from a polyline (M, 2)."""
     a, ab = line[:-1], np.diff(line, axis=0)
     t = ((xy[:, None] - a) * ab).sum(-1) / (ab**2).sum(-1)
     gap = xy[:, None] - a - np.clip(t, 0, 1)[..., None] * ab
@@ -181,31 +206,37 @@ def _segment_distance(xy: np.ndarray, line: np.ndarray) -> np.ndarray:
 
 
 def _grid(count: int) -> np.ndarray:
-    """All index pairs (count², 2) below count."""
+    """Returns all pairs (count², 2) of numbers below `count`."""
     return np.argwhere(np.ones((count, count), dtype=bool))
 
 
 class Ground:
     """Rolling ground with the streets cut into it.
 
-    The height is linear on the triangles of a lattice, so `height` is exactly the surface of the mesh.
+    Its height is linear on each triangle of a lattice. The mesh uses the same triangles, so `height` agrees with it
+    exactly.
     """
 
     def __init__(
-        self, streets: list[Street], extent: float, rng: np.random.Generator, steepness: float, kerb: float = KERB
+        self,
+        streets: list[Street],
+        extent: float,
+        rng: np.random.Generator,
+        steepness: float,
+        kerb_height: float = KERB_HEIGHT,
     ):
-        """Lay the streets on ground that covers [-extent, extent]² metres.
+        """Lays the streets on a square of ground around the origin.
 
         Args:
-            streets: their centrelines must lie on it.
-            extent: metres.
-            rng: source of the hills.
-            steepness: rise over run of the steepest slope, about.
-            kerb: how high pavements and lots lie above the carriageway, metres.
+            streets: Streets whose centrelines lie within the square, tails excepted.
+            extent: Half the side of the square, metres.
+            rng: Source of the hills.
+            steepness: Rise over run of the steepest slope, approximately.
+            kerb_height: Height of pavements and lots above the carriageway, metres.
         """
-        self.streets, self.kerb = streets, kerb
+        self.streets, self.kerb_height = streets, kerb_height
         self.extent = int(np.ceil(extent / (2 * _CELL))) * 2 * _CELL
-        self._edge = self._distance_raster()
+        self._kerb_distance = self._distance_raster()
         axis = np.arange(-self.extent, self.extent + 1, _CELL, dtype=np.float64)
         x, y = np.meshgrid(axis, axis, indexing="ij")
         lattice = np.zeros_like(x)
@@ -215,10 +246,12 @@ class Ground:
             lattice += length * np.sin(k * (np.cos(turn) * x + np.sin(turn) * y) + phase)
         slope = np.hypot(*np.gradient(lattice, _CELL))
         lattice *= steepness * rng.uniform(0.91, 1.09) / slope.max()
-        rough = np.clip((self._edge[::_CELL, ::_CELL] - 10) / 10, 0, 1)  # lawns and fields are not ironed
+        rough = np.clip(
+            (self._kerb_distance[::_CELL, ::_CELL] - 10) / 10, 0, 1
+        )  # Lawns and fields are a little uneven.
         lattice += 0.05 * rough * rng.standard_normal(lattice.shape)
-        # far from streets every second node lies on the line between its neighbours: larger cells fit there exactly
-        far = self._edge[::_CELL, ::_CELL] >= _FAR
+        # Far from streets every second node lies on the line between its neighbours, so larger cells fit there exactly.
+        far = self._kerb_distance[::_CELL, ::_CELL] >= _FAR
         between = lattice.copy()
         between[1::2, ::2] = 0.5 * (lattice[:-1:2, ::2] + lattice[2::2, ::2])
         between[::2, 1::2] = 0.5 * (lattice[::2, :-1:2] + lattice[::2, 2::2])
@@ -226,22 +259,22 @@ class Ground:
         self._lattice = np.where(far, between, lattice)
 
     def _distance_raster(self) -> np.ndarray:
-        """Signed distance to the kerb on a 1 m grid, negative on carriageways, cut off at _FAR."""
+        """Returns the signed distance to the kerb [m] on a grid of 1 m: negative on carriageways, at most `_FAR`."""
         n = 2 * self.extent + 1
         fields = []
         for number, street in enumerate(self.streets):
-            # apart from each other, so that no two meet in the blend out there
+            # Each street starts from its own large value. Equal values would blend far from the streets.
             field = np.full((n, n), 100.0 * (1 + number))
             for i in range(0, len(street.line) - 1, 10):
                 line = street.line[i : i + 11]
-                low = np.floor(line.min(0) - _FAR - street.half).astype(int) + self.extent
-                high = np.ceil(line.max(0) + _FAR + street.half).astype(int) + self.extent + 1
+                low = np.floor(line.min(0) - _FAR - street.half_width).astype(int) + self.extent
+                high = np.ceil(line.max(0) + _FAR + street.half_width).astype(int) + self.extent + 1
                 low, high = np.clip(low, 0, n), np.clip(high, 0, n)
                 x, y = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]), indexing="ij")
                 xy = np.stack([x.ravel(), y.ravel()], axis=1) - float(self.extent)
                 window = field[low[0] : high[0], low[1] : high[1]]
                 np.minimum(window, _segment_distance(xy, line).reshape(x.shape), out=window)
-            fields.append(field - street.half)
+            fields.append(field - street.half_width)
         edge = fields[0]
         for field in fields[1:]:
             blend = np.maximum(_CORNER - np.abs(edge - field), 0)
@@ -249,19 +282,20 @@ class Ground:
         for street, field in zip(self.streets, fields, strict=True):
             if street.median:
                 others = np.min([f for f in fields if f is not field], axis=0)
-                edge = np.maximum(edge, -np.maximum(field + street.half - street.median, 5.0 - others))
+                edge = np.maximum(edge, -np.maximum(field + street.half_width - street.median, 5.0 - others))
         return np.minimum(edge, _FAR)
 
-    def edge(self, xy: np.ndarray) -> np.ndarray:
-        """Signed distance (N,) of points (N, 2) from the kerb, metres: negative on a carriageway, at most 18.
+    def kerb_distance(self, xy: np.ndarray) -> np.ndarray:
+        """Returns the signed distances (N,) [m] of points (N, 2) from the kerb.
 
-        Beyond the ground it is 0, so that nothing is put there.
+        They are negative on a carriageway, and at most `_FAR`. Outside the ground they are 0, so nothing is put there.
         """
         at = np.asarray(xy, dtype=np.float64) + self.extent
-        return np.where((np.abs(at - self.extent) < self.extent).all(-1), self._bilinear(self._edge, at), 0.0)
+        return np.where((np.abs(at - self.extent) < self.extent).all(-1), self._bilinear(self._kerb_distance, at), 0.0)
 
     @staticmethod
     def _bilinear(raster: np.ndarray, at: np.ndarray) -> np.ndarray:
+        """Returns the values (N,) of a raster at continuous indices (N, 2)."""
         low = np.clip(np.floor(at).astype(int), 0, np.array(raster.shape) - 2)
         u, v = (np.clip(at - low, 0, 1)).T
         i, j = low.T
@@ -270,7 +304,7 @@ class Ground:
         ) * v
 
     def height(self, xy: np.ndarray) -> np.ndarray:
-        """Height (N,) of the carriageway level at points (N, 2), metres; pavements and lots lie `kerb` above it."""
+        """Returns the heights (N,) [m] of the carriageway level; pavements and lots lie `kerb_height` above it."""
         at = (np.asarray(xy, dtype=np.float64) + self.extent) / _CELL
         low = np.clip(np.floor(at).astype(int), 0, np.array(self._lattice.shape) - 2)
         u, v = (at - low).T
@@ -280,29 +314,29 @@ class Ground:
         return np.where(u > v, a + u * (b - a) + v * (c - b), a + v * (d - a) + u * (c - d))
 
     def surface(self, xy: np.ndarray) -> np.ndarray:
-        """Points (N, 3) on top of whatever ground lies at (N, 2): carriageway, pavement or lot."""
+        """Returns points (N, 3) [m] on top of the carriageway, pavement or lot at (N, 2)."""
         xy = np.asarray(xy, dtype=np.float64)
-        return np.column_stack([xy, self.height(xy) + self.kerb * (self.edge(xy) > 0)])
+        return np.column_stack([xy, self.height(xy) + self.kerb_height * (self.kerb_distance(xy) > 0)])
 
     def mesh(self) -> Part:
-        """The ground as triangles, closed, with upright kerbs."""
+        """Returns the ground as a closed surface with upright kerbs."""
         n = (len(self._lattice) - 1) // 2
-        negative = self._edge < 0
+        negative = self._kerb_distance < 0
         parts = []
         size = 2 * _CELL
         cells = _grid(n) * size
-        while size > 1:  # halve the cells whose nodes lie on both sides of the kerb
+        while size > 1:  # Cells with nodes on both sides of the kerb are halved.
             nodes = cells[:, None] + _grid(size + 1)
             below = negative[nodes[..., 0], nodes[..., 1]]
             every = below.all(1)
             cut = below.any(1) & ~every
             if size > _CELL:
-                cut = (self._edge[nodes[..., 0], nodes[..., 1]] < _FAR).any(1)
+                cut = (self._kerb_distance[nodes[..., 0], nodes[..., 1]] < _FAR).any(1)
             parts.append(self._lift(self._cell_triangles(cells[~cut], size), np.repeat(every[~cut], 2)))
             size //= 2
             cells = (cells[cut, None] + size * _grid(2)).reshape(-1, 2)
         parts += self._cut(self._cell_triangles(cells, 1))
-        # a second floor below catches the rare ray that slips through the seam of two cell sizes
+        # A second floor below catches the rare ray that slips through where cells of two sizes meet.
         sunk = self._cell_triangles(_grid(n // 2) * 4 * _CELL, 4 * _CELL)
         floor = self._lift(sunk, np.ones(len(sunk), bool))
         parts.append(Part(floor.vertices - (0, 0, 1.5), floor.triangles))
@@ -310,19 +344,19 @@ class Ground:
 
     @staticmethod
     def _cell_triangles(cells: np.ndarray, size: int) -> np.ndarray:
-        """Both halves (2N, 3, 2) of square cells, as node indices of the 1 m grid."""
+        """Returns two triangles per square cell (2N, 3, 2), as nodes of the grid of 1 m."""
         a, b, c, d = (cells + np.array(step) * size for step in ((0, 0), (1, 0), (1, 1), (0, 1)))
         return np.stack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)], 1).reshape(-1, 3, 2)
 
     def _lift(self, nodes: np.ndarray, road: np.ndarray) -> Part:
-        """Triangles of nodes (N, 3, 2), on the carriageway where road (N,), else the kerb above it."""
+        """Returns triangles of nodes (N, 3, 2), at carriageway level where `road` (N,) and else a kerb above it."""
         xy = nodes.reshape(-1, 2) - float(self.extent)
-        z = self.height(xy) + self.kerb * np.repeat(~road, 3)
+        z = self.height(xy) + self.kerb_height * np.repeat(~road, 3)
         return Part(np.column_stack([xy, z]), np.arange(len(xy)).reshape(-1, 3))
 
     def _cut(self, nodes: np.ndarray) -> list[Part]:
-        """Triangles of nodes (N, 3, 2) split along the kerb, and the kerb's face."""
-        value = self._edge[nodes[..., 0], nodes[..., 1]]
+        """Returns triangles of nodes (N, 3, 2) split along the kerb, and the upright face of the kerb."""
+        value = self._kerb_distance[nodes[..., 0], nodes[..., 1]]
         below = value < 0
         count = below.sum(1)
         parts = [self._lift(nodes[count == 3], np.ones((count == 3).sum(), bool))]
@@ -338,7 +372,7 @@ class Ground:
             q2 = p[:, 0] + (val[:, 0] / (val[:, 0] - val[:, 2]))[:, None] * (p[:, 2] - p[:, 0])
             polygon = np.stack([p[:, 0], q1, q2, p[:, 1], p[:, 2]], 1)
             z = self.height(polygon.reshape(-1, 2)).reshape(-1, 5, 1)
-            low, high = np.concatenate([polygon, z], -1), np.concatenate([polygon, z + self.kerb], -1)
+            low, high = np.concatenate([polygon, z], -1), np.concatenate([polygon, z + self.kerb_height], -1)
             tip_side, base_side = (low, high) if road_tip else (high, low)
             every = np.concatenate([tip_side, base_side], axis=1)
             faces = np.array([[0, 1, 2], [6, 8, 9], [6, 9, 7], [1, 2, 7], [1, 7, 6]])

@@ -1,15 +1,17 @@
-"""Barriers, industry, farms and squares. Prototypes stand at the origin on z = 0, metres.
+"""Barriers, and what stands on highways, yards, farms and squares.
 
-Panels run along +x from the origin; what has a front faces +x.
+Each structure stands at the origin on z = 0, in metres; its front faces +x. Copies are placed in the town.
 """
 
 import numpy as np
 
 from ilnet.world.towns.furniture import railing
-from ilnet.world.towns.parts import Part, boxes, loft, merge, place, quads, shift, tubes
+from ilnet.world.towns.parts import Panel, Part, boxes, loft, merge, place, quads, shift, tubes
 from ilnet.world.towns.vehicles import pedestrian, wheels
 
 __all__ = [
+    "PYLON_ARMS",
+    "TRAM_WIRE_HEIGHT",
     "bale",
     "bank",
     "concrete_barrier",
@@ -34,8 +36,14 @@ __all__ = [
 ]
 
 
+# Reach and height of the crossarms of a pylon [m]; wires hang 0.2 m below.
+PYLON_ARMS = ((3.2, 13.0), (4.0, 15.5), (2.8, 18.0))
+# Height of the wire over a tram [m].
+TRAM_WIRE_HEIGHT = 5.6
+
+
 def _extrude(section: list[tuple[float, float]], length: float) -> Part:
-    """A closed section (y, z) drawn out along +x."""
+    """Returns a closed section of points (y, z) extruded along +x from the origin; all in metres."""
     yz = np.array(section, dtype=np.float64)
     rings = np.zeros((2, len(yz), 3))
     rings[1, :, 0] = length
@@ -43,8 +51,8 @@ def _extrude(section: list[tuple[float, float]], length: float) -> Part:
     return loft(rings)
 
 
-def guard_rail() -> Part:
-    """A panel of 4 m: posts, and a folded steel beam on the side of -y."""
+def guard_rail() -> Panel:
+    """Returns 4 m of guard rail: posts, and a folded steel beam on the side of -y."""
     beam = [
         (0.0, 0.45),
         (-0.08, 0.5),
@@ -56,28 +64,26 @@ def guard_rail() -> Part:
         (0.02, 0.6),
     ]
     posts = boxes([[x, 0.02, -0.6] for x in (0.5, 2.5)], [[x + 0.1, 0.14, 0.75] for x in (0.5, 2.5)])
-    return merge([_extrude(beam, 4.0), posts])
+    return Panel(merge([_extrude(beam, 4.0), posts]), 4.0)
 
 
-def concrete_barrier() -> Part:
-    """A panel of 4 m of the low wall between two carriageways."""
-    return _extrude(
-        [
-            (-0.32, -0.3),
-            (-0.32, 0.08),
-            (-0.18, 0.33),
-            (-0.1, 0.9),
-            (0.1, 0.9),
-            (0.18, 0.33),
-            (0.32, 0.08),
-            (0.32, -0.3),
-        ],
-        3.94,
-    )
+def concrete_barrier() -> Panel:
+    """Returns 4 m of the low wall between two carriageways, with a gap before the next piece."""
+    section = [
+        (-0.32, -0.3),
+        (-0.32, 0.08),
+        (-0.18, 0.33),
+        (-0.1, 0.9),
+        (0.1, 0.9),
+        (0.18, 0.33),
+        (0.32, 0.08),
+        (0.32, -0.3),
+    ]
+    return Panel(_extrude(section, 3.94), 4.0)
 
 
-def noise_wall(height: float) -> Part:
-    """A panel of 4 m: a post, and planks of which every other one stands back."""
+def noise_wall(height: float) -> Panel:
+    """Returns 4 m of noise wall: a post, and planks of which every other one is recessed; `height` in metres."""
     z = np.arange(0.0, height - 0.2, 0.5)
     back = 0.05 * (np.arange(len(z)) % 2)
     zero = np.zeros(len(z))
@@ -85,36 +91,38 @@ def noise_wall(height: float) -> Part:
         np.column_stack([zero + 0.1, back - 0.06, z - 0.4 * (z == 0)]),
         np.column_stack([zero + 3.9, back + 0.06, z + 0.5]),
     )
-    return merge([planks, boxes([-0.12, -0.14, -0.5], [0.12, 0.14, height + 0.1])])
+    post = boxes([-0.12, -0.14, -0.5], [0.12, 0.14, height + 0.1])
+    return Panel(merge([planks, post]), 4.0)
 
 
-def mesh_fence() -> Part:
-    """A panel of 3 m, 2.2 m high, of a wire fence: posts, rails, and every fourth upright of its mesh."""
-    posts = tubes([0, 0, -0.4], [0, 0, 2.2], 0.035, sides=5)
+def mesh_fence() -> Panel:
+    """Returns 3 m of wire fence, 2.2 m high: a post, rails, and every fourth upright of its mesh."""
+    post = tubes([0, 0, -0.4], [0, 0, 2.2], 0.035, sides=5)
     arm = tubes([0, 0, 2.2], [0, -0.3, 2.5], 0.03, sides=4)
     rails = tubes([[0, 0, z] for z in (0.08, 1.1, 2.15)], [[3, 0, z] for z in (0.08, 1.1, 2.15)], 0.022, caps=False)
     x = np.arange(0.2, 3.0, 0.2)
     rods = tubes([[v, 0, 0.08] for v in x], [[v, 0, 2.15] for v in x], 0.006, sides=3, caps=False)
-    return merge([posts, arm, rails, rods])
+    return Panel(merge([post, arm, rails, rods]), 3.0)
 
 
-def post_and_rail() -> Part:
-    """A panel of 2.5 m of a paddock fence."""
-    posts = boxes([-0.06, -0.06, -0.4], [0.06, 0.06, 1.25])
+def post_and_rail() -> Panel:
+    """Returns 2.5 m of paddock fence."""
+    post = boxes([-0.06, -0.06, -0.4], [0.06, 0.06, 1.25])
     rails = boxes([[0, 0.05, z] for z in (0.35, 0.7, 1.05)], [[2.5, 0.09, z + 0.12] for z in (0.35, 0.7, 1.05)])
-    return merge([posts, rails])
+    return Panel(merge([post, rails]), 2.5)
 
 
-def stone_wall(rng: np.random.Generator, height: float) -> Part:
-    """A panel of 3 m of a dry wall with uneven coping."""
+def stone_wall(rng: np.random.Generator, height: float) -> Panel:
+    """Returns 3 m of dry stone wall with uneven coping; `height` in metres."""
     x = np.arange(0.0, 3.0, 0.3)
     top = height + rng.uniform(-0.05, 0.05, len(x))
     out = rng.uniform(0.22, 0.27, len(x))
-    return boxes(np.column_stack([x, -out, np.full(len(x), -0.4)]), np.column_stack([x + 0.3, out, top]), ends=True)
+    stones = boxes(np.column_stack([x, -out, np.full(len(x), -0.4)]), np.column_stack([x + 0.3, out, top]))
+    return Panel(stones, 3.0)
 
 
-def bank(height: float) -> Part:
-    """A panel of 4 m of an earth bank."""
+def bank(height: float) -> Panel:
+    """Returns 4 m of earth bank; `height` in metres."""
     section = [
         (-1.1, -0.3),
         (-0.9, 0.15 * height),
@@ -123,11 +131,11 @@ def bank(height: float) -> Part:
         (0.9, 0.2 * height),
         (1.1, -0.3),
     ]
-    return _extrude(section, 4.0)
+    return Panel(_extrude(section, 4.0), 4.0)
 
 
 def gantry(span: float) -> Part:
-    """A lattice beam across a carriageway, along y and centred, with signs that face -x and +x."""
+    """Returns a lattice beam with signs that face -x and +x; it spans `span` metres along y, centred."""
     half = span / 2
     corners = np.array([[x, z] for x in (-0.35, 0.35) for z in (6.2, 7.2)])
     chords = tubes([[x, -half, z] for x, z in corners], [[x, half, z] for x, z in corners], 0.06)
@@ -159,10 +167,10 @@ def gantry(span: float) -> Part:
 
 
 def overpass(span: float) -> Part:
-    """A bridge along y, centred, that clears 5.6 m, on piers in the middle, with a sloping bank at either end.
+    """Returns a bridge along y, centred: its deck is 5.6 m above the ground, on piers, with a sloping bank at each end.
 
     Args:
-        span: between the abutments, metres.
+        span: Distance between the abutments, metres.
     """
     half, top = span / 2, 6.4
     deck = boxes([[-3.8, -half - 1, 5.6], [-4.0, -half - 1, 6.2]], [[3.8, half + 1, top], [4.0, half + 1, 6.3]])
@@ -177,7 +185,7 @@ def overpass(span: float) -> Part:
 
 
 def container(length: float = 6.06) -> Part:
-    """A shipping container along x, centred, with folded sides."""
+    """Returns a shipping container with folded sides, `length` metres long along x and centred."""
     count = int(length / 0.28) * 2
     x = np.linspace(-length / 2 + 0.1, length / 2 - 0.1, count + 1)
     y = np.where(np.arange(count + 1) // 2 % 2, 1.22, 1.18)
@@ -201,7 +209,7 @@ def container(length: float = 6.06) -> Part:
 
 
 def trailer() -> Part:
-    """A parked semi-trailer along x, 12.6 m long, its doors at -x."""
+    """Returns a parked semi-trailer, 12.6 m long along x, with its doors at -x."""
     cargo = boxes([-6.3, -1.25, 1.2], [6.3, 1.25, 3.9])
     frame = boxes(
         [[-6.2, -0.5, 0.85], [3.0, -0.9, 0.0], [3.0, 0.8, 0.0], [-6.25, -1.2, 0.5]],
@@ -211,7 +219,7 @@ def trailer() -> Part:
 
 
 def tank(radius: float, height: float) -> Part:
-    """An upright tank with a low cone, a ladder and a rail around its top."""
+    """Returns an upright tank with a low cone, a ladder and a rail around its top; all in metres."""
     shell = tubes([0, 0, -1.5], [0, 0, height], radius, sides=20, caps=False)
     roof = tubes([0, 0, height], [0, 0, height + 0.18 * radius], radius, 0.15, sides=20)
     turn = np.linspace(0, 2 * np.pi, 21)
@@ -231,7 +239,7 @@ def tank(radius: float, height: float) -> Part:
 
 
 def silo(radius: float, height: float) -> Part:
-    """A tower silo with a dome, hoops and a filling pipe."""
+    """Returns a tower silo with a dome, hoops and a filling pipe; all in metres."""
     shell = tubes([0, 0, -1.5], [0, 0, height], radius, sides=18, caps=False)
     dome = [
         tubes([0, 0, height + a * radius], [0, 0, height + b * radius], radius * c, radius * d, sides=18, caps=False)
@@ -244,11 +252,11 @@ def silo(radius: float, height: float) -> Part:
 
 
 def scaffold(width: float, lifts: int) -> Part:
-    """A scaffold along x, centred, before a wall at y = 0, 1.1 m deep: standards, ledgers, braces, boards.
+    """Returns a scaffold in front of a wall at y = 0, centred and 1.1 m deep: standards, ledgers, braces, boards.
 
     Args:
-        width: metres.
-        lifts: how many decks, 2 m apart.
+        width: Length along x, metres.
+        lifts: Number of decks, 2 m apart.
     """
     x = np.linspace(-width / 2, width / 2, max(2, round(width / 2.4) + 1))
     top, z = 2.0 * lifts + 1.1, 2.0 * np.arange(1, lifts + 1)
@@ -263,12 +271,12 @@ def scaffold(width: float, lifts: int) -> Part:
 
 
 def bale() -> Part:
-    """A round bale of straw."""
+    """Returns a round bale of straw."""
     return tubes([-0.6, 0, 0.68], [0.6, 0, 0.68], 0.7, sides=14)
 
 
 def stall(rng: np.random.Generator) -> Part:
-    """A market stall, 3 m along y, open towards +x, with goods on its table."""
+    """Returns a market stall, 3 m long along y and open towards +x, with goods on its table."""
     posts = [[x, y, -0.1] for x in (-1.0, 1.0) for y in (-1.45, 1.45)]
     frame = tubes(posts, np.add(posts, (0, 0, 2.25)), 0.03, sides=5)
     ridge = 2.9
@@ -287,7 +295,7 @@ def stall(rng: np.random.Generator) -> Part:
 
 
 def parasol(open_: bool) -> Part:
-    """A café table with four chairs under a parasol, open or folded."""
+    """Returns a café table with four chairs under a parasol, which is open or folded."""
     pole = tubes([0, 0, -0.1], [0, 0, 2.7], 0.03, sides=5)
     shade = (
         tubes([0, 0, 2.2], [0, 0, 2.7], 1.5, 0.05, sides=8, caps=False)
@@ -310,7 +318,7 @@ def parasol(open_: bool) -> Part:
 
 
 def fountain() -> Part:
-    """A round basin of 4 m radius with a bowl on a column."""
+    """Returns a fountain: a round basin of 4 m radius with a bowl on a column."""
     turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     profile = [(4.0, -0.3), (4.0, 0.55), (4.1, 0.6), (3.6, 0.62), (3.6, 0.35), (0.6, 0.35)]
     rings = np.stack([np.column_stack([r * np.cos(turn), r * np.sin(turn), np.full(24, z)]) for r, z in profile])
@@ -325,7 +333,7 @@ def fountain() -> Part:
 
 
 def statue() -> Part:
-    """A figure of twice a man's height on a stepped plinth."""
+    """Returns a statue of twice a person's height on a stepped plinth."""
     steps = boxes(
         [[-2.2, -2.2, -0.4], [-1.7, -1.7, 0.2], [-1.0, -1.0, 0.4], [-1.15, -1.15, 2.6]],
         [[2.2, 2.2, 0.2], [1.7, 1.7, 0.4], [1.0, 1.0, 2.6], [1.15, 1.15, 2.8]],
@@ -334,18 +342,18 @@ def statue() -> Part:
 
 
 def tram_mast(arm: float) -> Part:
-    """A mast whose arm along +x carries the overhead wire, 5.6 m up, at its end."""
+    """Returns a mast whose arm, `arm` metres along +x, carries the overhead wire at its end."""
     return merge(
         [
             tubes([0, 0, -0.4], [0, 0, 7.4], 0.13, 0.09, sides=8),
             tubes([[0, 0, 6.0], [0, 0, 7.2]], [[arm, 0, 6.0], [arm, 0, 6.05]], [0.04, 0.015], sides=5),
-            tubes([arm, 0, 5.6], [arm, 0, 6.0], 0.02),
+            tubes([arm, 0, TRAM_WIRE_HEIGHT], [arm, 0, 6.0], 0.02),
         ]
     )
 
 
 def pylon() -> Part:
-    """A lattice pylon, 19 m high, with three crossarms along y."""
+    """Returns a lattice pylon, 19 m high, with crossarms along y at `PYLON_ARMS`."""
     z = np.array([0.0, 3.5, 6.5, 9.0, 11.0, 13.0, 15.0, 17.0, 19.0])
     half = np.interp(z, [0, 11, 19], [1.7, 0.6, 0.25])
     corner = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
@@ -357,13 +365,13 @@ def pylon() -> Part:
         tubes(turned[:-1].reshape(-1, 3), knots[1:].reshape(-1, 3), 0.035, caps=False),
     ]
     arms = tubes(
-        [[0, -a, v] for a, v in ((3.2, 13), (4, 15.5), (2.8, 18))],
-        [[0, a, v] for a, v in ((3.2, 13), (4, 15.5), (2.8, 18))],
+        [[0, -a, v] for a, v in PYLON_ARMS],
+        [[0, a, v] for a, v in PYLON_ARMS],
         0.09,
     )
     stays = tubes(
-        [[0, s * a, v] for a, v in ((3.2, 13), (4, 15.5), (2.8, 18)) for s in (-1, 1)],
-        [[0, 0, v + 1.2] for v in (13, 13, 15.5, 15.5, 18, 18)],
+        [[0, s * a, v] for a, v in PYLON_ARMS for s in (-1, 1)],
+        [[0, 0, v + 1.2] for _, v in PYLON_ARMS for _ in (-1, 1)],
         0.04,
     )
     return merge([legs, *braces, arms, stays])

@@ -1,4 +1,4 @@
-"""town01: a small town around an avenue, with a market street, rows, gardens and open edges."""
+"""town01: a small town around an avenue, with a market street, rows of houses, gardens and open edges."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ __all__ = ["PLAN"]
 
 
 def _streets(rng: np.random.Generator) -> dict[str, Street]:
-    """On about 450 m x 450 m."""
+    """Returns the streets of a town of about 450 m by 450 m."""
     draft = Draft(rng)
     curve, on = draft.curve, draft.on
     avenue = curve([(-225, -20), (-110, 5), (0, -10), (110, -25), (225, 10)])
@@ -43,7 +43,7 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
 
 
 def _landmarks(site: Site, streets: dict[str, Street], greens: Greens, rng: np.random.Generator) -> None:
-    """Traffic lights on the avenue."""
+    """Sets traffic lights on the avenue."""
     for other in ("market", "east"):
         signals(site, streets["avenue"], streets[other])
 

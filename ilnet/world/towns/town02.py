@@ -1,4 +1,4 @@
-"""town02: a village of cottages and gardens, with a church, side lanes that end in turning circles, hedges."""
+"""town02: a village of cottages and gardens with a church, and side lanes that end in turning circles."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ __all__ = ["PLAN"]
 
 
 def _streets(rng: np.random.Generator) -> dict[str, Street]:
-    """On about 500 m x 450 m."""
+    """Returns the streets of a town of about 500 m by 450 m."""
     draft = Draft(rng)
     curve, on = draft.curve, draft.on
     main = curve([(-250, -50), (-130, 25), (0, -20), (120, 30), (250, -15)])
@@ -55,7 +55,7 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
 
 
 def _landmarks(site: Site, streets: dict[str, Street], greens: Greens, rng: np.random.Generator) -> None:
-    """The church."""
+    """Builds the church."""
     churchyard(site, streets["main"], 0.52, greens, rng)
 
 

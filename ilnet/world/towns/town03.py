@@ -12,7 +12,7 @@ __all__ = ["PLAN"]
 
 
 def _streets(rng: np.random.Generator) -> dict[str, Street]:
-    """On about 500 m x 500 m."""
+    """Returns the streets of a town of about 500 m by 500 m."""
     draft = Draft(rng, 12.0)
     curve, on = draft.curve, draft.on
     ring = draft.ring((0, 0), 21.0)
@@ -56,7 +56,7 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
 
 
 def _landmarks(site: Site, streets: dict[str, Street], greens: Greens, rng: np.random.Generator) -> None:
-    """Trees and a statue on the roundabout, a park on a slope."""
+    """Fills the roundabout with trees and a statue, and builds a park on a slope."""
     island(site, streets["ring"], greens, rng)
     park(site, streets["crescent"], 0.45, 1, 46.0, 34.0, greens, rng)
 

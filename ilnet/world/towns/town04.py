@@ -10,11 +10,11 @@ from ilnet.world.towns.streets import Draft, Street
 
 __all__ = ["PLAN"]
 
-_HALF = 14.6
+_HIGHWAY_HALF_WIDTH = 14.6
 
 
 def _streets(rng: np.random.Generator) -> dict[str, Street]:
-    """On about 760 m x 480 m."""
+    """Returns the streets of a town of about 760 m by 480 m."""
     draft = Draft(rng, 9.0)
     curve, on, beside = draft.curve, draft.on, draft.beside
     highway = curve([(-370, -10), (-230, -75), (-60, -95), (110, -70), (250, -10), (370, 95)])
@@ -40,7 +40,9 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
     still = Draft.straight
     return draft.settle(
         {
-            "highway": Street(highway, _HALF, (3.75, 7.25, 10.75), "highway", 3.0, parking=False, median=1.35),
+            "highway": Street(
+                highway, _HIGHWAY_HALF_WIDTH, (3.75, 7.25, 10.75), "highway", 3.0, parking=False, median=1.35
+            ),
             "village": Street(village, 5.2, (1.6,), "shops", 2.4),
             "off": Street(still(off), 2.7, (0.0,), "ramp", 1.5, parking=False, oneway=True),
             "onto": Street(still(onto), 2.7, (0.0,), "ramp", 1.5, parking=False, oneway=True),
@@ -53,7 +55,7 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
 
 
 def _landmarks(site: Site, streets: dict[str, Street], greens: Greens, rng: np.random.Generator) -> None:
-    """Walls that keep the noise from the settlement, a bridge, a church, and fields."""
+    """Builds noise walls in front of the settlement, a bridge, a church and fields."""
     noise_walls(site, streets["highway"], -1, 0.36, 0.66, rng)
     bridge(site, streets["highway"], 0.51)
     churchyard(site, streets["village"], 0.72, greens, rng)

@@ -13,7 +13,7 @@ __all__ = ["PLAN"]
 
 
 def _streets(rng: np.random.Generator) -> dict[str, Street]:
-    """On about 460 m x 440 m."""
+    """Returns the streets of a town of about 460 m by 440 m."""
     draft = Draft(rng, 5.0)
     lines = {}
     for name, y in (("first", -135), ("second", 0), ("third", 130)):
@@ -32,7 +32,7 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
 
 
 def _landmarks(site: Site, streets: dict[str, Street], greens: Greens, rng: np.random.Generator) -> None:
-    """Traffic lights at the crossings, a park that fills one block."""
+    """Sets traffic lights at the crossings, and fills one block with a park."""
     for across in ("first", "second", "third"):
         for along in "abcd":
             signals(site, streets[across], streets[along])

@@ -13,7 +13,7 @@ __all__ = ["PLAN"]
 
 
 def _streets(rng: np.random.Generator) -> dict[str, Street]:
-    """On about 560 m x 500 m."""
+    """Returns the streets of a town of about 560 m by 500 m."""
     draft = Draft(rng, 10.0)
     curve, on = draft.curve, draft.on
     spine = curve([(-280, -30), (-120, 0), (60, -15), (280, 30)])
@@ -36,7 +36,7 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
 
 
 def _landmarks(site: Site, streets: dict[str, Street], greens: Greens, rng: np.random.Generator) -> None:
-    """Traffic lights, a tank farm, a container yard, and pylons."""
+    """Builds traffic lights, a tank farm, two container yards and a power line."""
     for other in ("gate", "dock"):
         signals(site, streets["spine"], streets[other])
     tank_farm(site, streets["dock"], 0.3, 1, rng)

@@ -1,4 +1,4 @@
-"""town07: farms, barns and fields along narrow lanes without kerbs, between walls, hedges, banks and rows of trees."""
+"""town07: farms, barns and fields along narrow lanes without kerbs, with walls, hedges, banks and rows of trees."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ __all__ = ["PLAN"]
 
 
 def _streets(rng: np.random.Generator) -> dict[str, Street]:
-    """On about 560 m x 440 m."""
+    """Returns the streets of a town of about 560 m by 440 m."""
     draft = Draft(rng)
     curve, on = draft.curve, draft.on
     road = curve([(-265, -65), (-190, 15), (-70, -30), (40, 35), (160, -20), (265, 40)])
@@ -35,8 +35,8 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
 
 
 def _landmarks(site: Site, streets: dict[str, Street], greens: Greens, rng: np.random.Generator) -> None:
-    """Field boundaries."""
+    """Bounds the fields."""
     fields(site, greens, rng)
 
 
-PLAN = Plan(_streets, _landmarks, steepness=0.07, kerb=0.0)
+PLAN = Plan(_streets, _landmarks, steepness=0.07, kerb_height=0.0)

@@ -1,4 +1,4 @@
-"""town10: a dense old centre: narrow curved streets and arcades around a square, a tram, towers at the edge."""
+"""town10: a dense old centre of narrow curved streets around a market square, with a tram and towers at the edge."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ __all__ = ["PLAN"]
 
 
 def _streets(rng: np.random.Generator) -> dict[str, Street]:
-    """On about 400 m x 380 m."""
+    """Returns the streets of a town of about 400 m by 380 m."""
     draft = Draft(rng, 7.0)
     curve, on = draft.curve, draft.on
     square = draft.closed([(40, 0), (36, 24), (0, 30), (-38, 26), (-42, 0), (-36, -25), (0, -29), (38, -24)])
@@ -39,10 +39,10 @@ def _streets(rng: np.random.Generator) -> dict[str, Street]:
 
 
 def _landmarks(site: Site, streets: dict[str, Street], greens: Greens, rng: np.random.Generator) -> None:
-    """The market, the tram's masts and wires, traffic lights on the boulevard."""
+    """Builds the market square, the masts and wires of the tram, and traffic lights on the boulevard."""
     market_square(site, streets["square"], greens, rng)
     for name in ("east", "north"):
-        tram_line(site, streets[name], rng)
+        tram_line(site, streets[name])
         signals(site, streets["boulevard"], streets[name])
 
 

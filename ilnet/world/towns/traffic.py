@@ -1,4 +1,4 @@
-"""What moves: vehicles on the lanes and at the kerb, people on the pavements, drawn anew for every scan."""
+"""Traffic, drawn anew for every scan: vehicles on the lanes and at the kerb, people on the pavements."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -9,40 +9,47 @@ from numpy.typing import ArrayLike
 
 from ilnet.world.towns import vehicles
 from ilnet.world.towns.parts import EMPTY, Part, merge, place, raster
-from ilnet.world.towns.town import Town
+from ilnet.world.towns.town import LIDAR_REACH, WAYPOINT_SPACING, Town
 
 __all__ = ["traffic"]
 
+# Numbers of the kinds, in the order of `_fleet`.
 _CARS, _VAN, _LORRY, _BUS, _CYCLIST, _BICYCLE, _PEOPLE = (0, 1, 2), 3, 4, 5, 6, 7, (8, 9, 10)
-# Metres kept free ahead of and behind the sensor, whose own car is not drawn, and to its sides.
+# The sensor's own car is not drawn. So much is kept free for it ahead and behind, and to each side [m].
 _OWN_CAR = (4.5, 1.3)
-_STRETCH = 1.05  # vehicles differ in length, width and height by up to 5 %
+# Vehicles differ in length, width and height by up to 5 %.
+_STRETCH = 1.05
 
 
 class _Kind(NamedTuple):
+    """A kind of vehicle or person."""
+
     part: Part
+    """Stands at the origin and faces +x."""
     half_length: float
+    """From its middle to its front, of the largest one, metres."""
     half_width: float
+    """From its middle to its side, of the largest one, metres."""
     gap: float
-    """Metres kept free before and behind it while it drives."""
+    """Distance kept free ahead and behind while it drives, metres."""
 
 
 class _Things(NamedTuple):
-    """What might be drawn, N of them, the first ones first."""
+    """N vehicles and people that may be drawn. Where two overlap, the later one is left out."""
 
     spot: np.ndarray
     """(N, 4) x, y, z [m] and heading [rad]."""
     slope: np.ndarray
     """(N,) rise over run along the heading."""
     kind: np.ndarray
-    """(N,) row of the fleet."""
+    """(N,) number of the kind."""
     gap: np.ndarray
-    """(N,) metres kept free before and behind."""
+    """(N,) distance kept free ahead and behind, metres."""
 
 
 @cache
 def _fleet() -> tuple[_Kind, ...]:
-    """Returns the prototypes, by the numbers above."""
+    """Returns all kinds, by the numbers above."""
     walkers = [vehicles.pedestrian(*pose) for pose in ((0.7, 0.25), (0.5, 0.15), (0.1, 0.05))]
     gaps = {_LORRY: 3.5, _BUS: 3.5, _CYCLIST: 0.8} | dict.fromkeys((*_CARS, _VAN), 1.0)
     heavy = [vehicles.van(), vehicles.lorry(), vehicles.bus()]
@@ -58,30 +65,31 @@ def traffic(
     town: Town,
     at: ArrayLike,
     seed: int | Sequence[int],
-    radius: float = 85.0,
+    radius: float = LIDAR_REACH,
     sector: tuple[float, float] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draws the vehicles and people around a sensor; another seed draws others, more of them or fewer.
+    """Returns the mesh of the vehicles and people around a sensor. Another seed draws others, more or fewer.
 
-    No two overlap. The sensor's own car is left out, and its lane is free for about 5 m.
+    No two overlap. The sensor's own car is not drawn, and its lane is free for about 5 m.
 
     Args:
-        town: Where.
-        at: (3,) position of the sensor, metres.
-        seed: Of the draw; the same town, place and seed give the same arrays.
-        radius: How far from the sensor they are drawn, metres.
-        sector: The direction [rad, from +x] in which a sensor looks that does not turn full circle, and half the width
-            [rad] of what it sees; what stands elsewhere is left out, and the rest stays as it is.
+        town: The town around the sensor.
+        at: (3,) position of the sensor in the town's frame, metres.
+        seed: Seed of the draw; the same town, position and seed give the same arrays.
+        radius: Largest distance from the sensor at which they are drawn, metres.
+        sector: For a sensor that does not see the full circle: the direction in which it looks (rad counter-clockwise
+            from +x) and half the width of its field of view (rad). What stands outside is left out; the rest does not
+            change.
 
     Returns:
-        Vertices (V, 3) float32 [m] and triangles (F, 3) int32; empty where nothing is about.
+        Vertices (V, 3) float32 [m] and triangles (F, 3) int32; both empty if nothing was drawn.
 
     Raises:
         ValueError: If `at` is not three finite numbers.
     """
     position = np.asarray(at, dtype=np.float64)
     if position.shape != (3,) or not np.isfinite(position).all():
-        raise ValueError(f"at is {at!r}, should be three finite numbers: x, y, z in metres")
+        raise ValueError(f"at is {at!r}; it should be three finite numbers: x, y and z in metres")
     rng, sensor = np.random.default_rng(seed), position[:2]
     near = np.nonzero(_distance(town.waypoints, sensor) < radius)[0]
     lane = np.column_stack([town.waypoints[near], town.headings[near]]).astype(np.float64)
@@ -108,11 +116,12 @@ def traffic(
 
 
 def _distance(points: np.ndarray, sensor: np.ndarray) -> np.ndarray:
+    """Returns the horizontal distances (N,) [m] of points (N, 2 or more) from a sensor (2,)."""
     return np.hypot(points[:, 0] - sensor[0], points[:, 1] - sensor[1])
 
 
 def _in_sector(things: _Things, sensor: np.ndarray, heading: float, half: float) -> np.ndarray:
-    """Which things (N,) reach into a sector, judged by the circles around them."""
+    """Returns which things reach into a sector, as (N,) bool. The circle around each one decides."""
     away = things.spot[:, :2] - sensor
     distance = np.hypot(away[:, 0], away[:, 1])
     reach = np.array([np.hypot(k.half_length, k.half_width) for k in _fleet()])[things.kind]
@@ -121,27 +130,32 @@ def _in_sector(things: _Things, sensor: np.ndarray, heading: float, half: float)
 
 
 def _slope(town: Town, near: np.ndarray) -> np.ndarray:
-    """Rise over run (N,) from waypoints `near` to the next on their lane; 0 at the lane's end."""
+    """Returns rise over run (N,) from waypoints `near` to the next on their lanes; 0 at the end of a lane."""
     step = (town.waypoints[np.minimum(near + 1, len(town.waypoints) - 1)] - town.waypoints[near]).astype(np.float64)
     run = np.hypot(step[:, 0], step[:, 1])
+    # Waypoints on one lane are about `WAYPOINT_SPACING` apart; the first one of another lane is not.
     return np.where((run > 1.0) & (run < 2.5), step[:, 2] / np.maximum(run, 1.0), 0.0)
 
 
 def _things(spot: np.ndarray, slope: ArrayLike, kind: np.ndarray, drives: bool) -> _Things:
+    """Returns things with the gaps of their kinds if they drive, else with small ones."""
     gap = np.array([k.gap for k in _fleet()])[kind] if drives else np.full(len(spot), 0.1)
     return _Things(spot, np.broadcast_to(np.asarray(slope, dtype=np.float64), (len(spot),)), kind, gap)
 
 
 def _aside(spot: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Spots (N, 4) moved `right` metres (N,) to the right of their heading."""
+    """Returns spots (N, 4) moved `right` (N,) metres to the right of their headings."""
     step = np.column_stack([np.sin(spot[:, 3]), -np.cos(spot[:, 3])]) * right[:, None]
     return np.column_stack([spot[:, :2] + step, spot[:, 2:]])
 
 
 def _driving(lane: np.ndarray, slope: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> _Things:
-    """On the lanes, from an empty road to a slow column; cyclists keep to the right, and off the highways."""
+    """Draws what drives on the lanes, from a few vehicles to dense traffic.
+
+    Cyclists keep to the right, and to streets that have people beside them.
+    """
     spacing = np.exp(rng.uniform(np.log(16), np.log(110)))
-    pick = rng.permutation(np.nonzero(rng.random(len(lane)) < 1.8 / spacing)[0])
+    pick = rng.permutation(np.nonzero(rng.random(len(lane)) < WAYPOINT_SPACING / spacing)[0])
     lorries, cyclists = rng.uniform(0.03, 0.2), rng.uniform(0.0, 0.12)
     cars = 0.87 - lorries - cyclists
     share = [0.4 * cars, 0.35 * cars, 0.25 * cars, 0.13, 0.8 * lorries, 0.2 * lorries, cyclists]
@@ -152,7 +166,7 @@ def _driving(lane: np.ndarray, slope: np.ndarray, walks: np.ndarray, rng: np.ran
 
 
 def _crossing(lane: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> _Things:
-    """A few people on the carriageway, square to a lane, where there are pavements."""
+    """Draws a few people who cross a lane, where people walk beside it."""
     spot = lane[rng.random(len(lane)) < rng.uniform(0, 5) / max(len(lane), 1)]
     spot = spot[_beside(spot, walks)]
     spot = _aside(spot, rng.uniform(-1.5, 1.5, len(spot)))
@@ -161,34 +175,34 @@ def _crossing(lane: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> 
 
 
 def _beside(lane: np.ndarray, walks: np.ndarray) -> np.ndarray:
-    """Whether people walk within 12 m of points (N, 4) on lanes."""
+    """Returns which of points (N, 4) on lanes have a spot for people within 12 m, as (N,) bool."""
     return (np.hypot(*(lane[:, None, k] - walks[None, :, k] for k in (0, 1))) < 12).any(1)
 
 
 def _parked(parking: np.ndarray, lane: np.ndarray, slope: np.ndarray, rng: np.random.Generator) -> _Things:
-    """Cars, vans and now and then a bicycle at the kerb and on drives, most of them along the traffic."""
+    """Draws parked cars, vans and a few bicycles; most face the way the traffic goes."""
     spot = parking[rng.random(len(parking)) < rng.uniform(0.15, 0.75)]
     kind = rng.choice([*_CARS, _VAN, _BICYCLE], len(spot), p=[0.36, 0.27, 0.22, 0.12, 0.03])
     spot[:, 3] += np.pi * (rng.random(len(spot)) < 0.15) + rng.normal(0, 0.02, len(spot))
     tilt = np.zeros(len(spot))
-    if len(spot) and len(lane):  # the road beside them says how steeply they stand
+    if len(spot) and len(lane):  # They stand as steeply as the lane beside them.
         beside = np.hypot(*(spot[:, None, k] - lane[None, :, k] for k in (0, 1))).argmin(1)
         tilt = slope[beside] * np.cos(spot[:, 3] - lane[beside, 3])
     return _things(spot, tilt, kind, drives=False)
 
 
 def _walking(walks: np.ndarray, rng: np.random.Generator) -> _Things:
-    """People on the pavements, and some bicycles that lean there."""
+    """Draws people on the pavements, and a few bicycles."""
     spot = walks[rng.random(len(walks)) < rng.uniform(0.02, 0.3)]
     kind = rng.choice([*_PEOPLE, _BICYCLE], len(spot), p=[0.35, 0.3, 0.2, 0.15])
     return _things(spot, 0.0, kind, drives=False)
 
 
 def _apart(things: _Things, sensor: np.ndarray, heading: float) -> np.ndarray:
-    """Numbers of those things that keep clear of the sensor's car and of all before them.
+    """Returns the numbers of the things that overlap neither the sensor's car nor a thing kept before them.
 
-    Two rectangles overlap where neither has a side between them: the distance of their centres along each axis of
-    either is less than what both reach along it.
+    Two rectangles overlap if, along each of the four axes of the two, the distance between their centres is less than
+    the sum of their half extents.
     """
     fleet = _fleet()
     length = np.array([k.half_length for k in fleet])[things.kind] + things.gap
@@ -212,7 +226,7 @@ def _apart(things: _Things, sensor: np.ndarray, heading: float) -> np.ndarray:
 
 
 def _instances(things: _Things, number: int, scale: np.ndarray) -> Part:
-    """All things of one kind, tilted as the road is; scale (N, 3) is of all things."""
+    """Returns the mesh of all things of one kind, tilted like the road; `scale` (N, 3) has a row for each thing."""
     pick = things.kind == number
     if not pick.any():
         return EMPTY

@@ -1,4 +1,7 @@
-"""Cars, vans, lorries, bicycles, people. Prototypes stand at the origin on z = 0, facing +x, metres."""
+"""Cars, vans, lorries, buses, bicycles and people.
+
+Each stands at the origin on z = 0 and faces +x, in metres. Copies are placed by `traffic.py`.
+"""
 
 from collections.abc import Sequence
 
@@ -8,7 +11,8 @@ from ilnet.world.towns.parts import Part, boxes, loft, merge, polyline_tubes, sh
 
 __all__ = ["bicycle", "bus", "car", "cyclist", "lorry", "pedestrian", "van", "wheels"]
 
-# from the tail to the nose: x, belt height, roof or bonnet height, half width at the belt, half width at the top
+# Side profiles from the tail to the nose, in metres: x, height of the belt line, height of the roof or bonnet, half the
+# width at the belt line, half the width at the top.
 _HATCHBACK = [
     (-2.02, 0.72, 0.80, 0.76, 0.62),
     (-1.98, 0.86, 0.98, 0.84, 0.66),
@@ -59,20 +63,27 @@ _VAN = [
 
 
 def wheels(x: list[float], half_width: float, radius: float, width: float = 0.22) -> Part:
-    """Pairs of wheels."""
+    """Returns a pair of wheels at each x, their outer sides at `half_width` to the left and right; all in metres."""
     at = np.array([[px, side * half_width, radius] for px in x for side in (-1, 1)])
     inward = np.array([[0, -side * width, 0] for _ in x for side in (-1, 1)])
     return merge([tubes(at + inward, at, radius, sides=8)])
 
 
-def _body(profile: Sequence[tuple[float, ...]], wheels: tuple[float, float], radius: float, clearance: float) -> Part:
-    """Skin over a side profile, lifted over the wheels."""
+def _body(profile: Sequence[tuple[float, ...]], axles: tuple[float, float], radius: float, clearance: float) -> Part:
+    """Returns the skin over a side profile, with arches over the wheels.
+
+    Args:
+        profile: One of the tables above.
+        axles: x of the axles, metres.
+        radius: Radius of the wheels, metres.
+        clearance: Height of the underside, metres.
+    """
     table = np.array(profile)
-    arch = np.array([w + step for w in wheels for step in (-1.18, -0.85, 0.85, 1.18)])
-    near = np.array([w for w in wheels for _ in range(4)])
+    arch = np.array([w + step for w in axles for step in (-1.18, -0.85, 0.85, 1.18)])
+    near = np.array([w for w in axles for _ in range(4)])
     x = np.unique(np.concatenate([table[:, 0], near + (arch - near) * radius]))
     belt, top, wide, narrow = (np.interp(x, table[:, 0], table[:, k]) for k in range(1, 5))
-    gap = np.min([np.abs(x - w) for w in wheels], axis=0) / radius
+    gap = np.min([np.abs(x - w) for w in axles], axis=0) / radius
     low = clearance + np.interp(gap, [0.85, 1.18], [1.7 * radius - clearance, 0.0])
     low = np.where(gap > 1.18, clearance, low)
     ends = np.minimum(x - x[0], x[-1] - x)
@@ -92,12 +103,13 @@ def _body(profile: Sequence[tuple[float, ...]], wheels: tuple[float, float], rad
 
 
 def _mirrors(x: float, y: float, z: float) -> Part:
+    """Returns a mirror on each side, at `y` and -`y`; all in metres."""
     low = np.array([[x - 0.05, side * y - 0.11, z] for side in (-1, 1)])
     return boxes(low, np.add(low, (0.12, 0.22, 0.15)))
 
 
 def car(kind: int) -> Part:
-    """A hatchback, a saloon or an SUV (kind 0, 1, 2), about 4.1 to 4.6 m long."""
+    """Returns a car of 4.1 to 4.6 m; `kind` is 0 for a hatchback, 1 for a saloon, 2 for an SUV."""
     profile, axles, mirror = (
         (_HATCHBACK, (-1.25, 1.30), 0.92),
         (_SALOON, (-1.38, 1.42), 0.92),
@@ -122,13 +134,13 @@ def car(kind: int) -> Part:
 
 
 def van() -> Part:
-    """A panel van, 5.4 m long, 2.4 m high."""
+    """Returns a panel van, 5.4 m long and 2.4 m high."""
     body = _body(_VAN, (-1.6, 1.75), 0.36, 0.28)
     return merge([body, wheels([-1.6, 1.75], 0.98, 0.36), _mirrors(1.55, 1.1, 1.35)])
 
 
 def lorry() -> Part:
-    """A box lorry, 8.4 m long, 3.5 m high, with a gap between cab and box."""
+    """Returns a box lorry, 8.4 m long and 3.5 m high, with a gap between cab and box."""
     cab = [
         (2.45, 1.7, 2.75, 1.15, 1.05),
         (2.60, 1.7, 2.95, 1.20, 1.08),
@@ -147,7 +159,7 @@ def lorry() -> Part:
 
 
 def bus() -> Part:
-    """A city bus, 11 m long, 3.1 m high."""
+    """Returns a city bus, 11 m long and 3.1 m high."""
     body = [
         (-5.50, 1.3, 2.85, 1.18, 1.08),
         (-5.42, 1.3, 3.02, 1.25, 1.14),
@@ -163,7 +175,7 @@ def bus() -> Part:
 
 
 def bicycle() -> Part:
-    """A bicycle on its stand, 1.75 m long."""
+    """Returns an upright bicycle, 1.75 m long."""
     turn = np.linspace(0, 2 * np.pi, 13)
     hoop = np.stack([0.34 * np.cos(turn), np.zeros(13), 0.34 + 0.34 * np.sin(turn)], axis=1)
     rims = [shift(polyline_tubes(hoop, 0.022), x) for x in (-0.53, 0.53)]
@@ -175,7 +187,7 @@ def bicycle() -> Part:
 
 
 def cyclist() -> Part:
-    """A rider on a bicycle."""
+    """Returns a rider on a bicycle."""
     hip, shoulder, hand = np.array([-0.2, 0.0, 0.98]), np.array([0.1, 0.0, 1.45]), np.array([0.34, 0.0, 1.0])
     side = np.array([[0.0, -0.1, 0.0], [0.0, 0.1, 0.0]])
     knee, foot = np.array([[0.18, 0.0, 0.78], [0.1, 0.0, 0.62]]), np.array([[0.02, 0.0, 0.42], [-0.12, 0.0, 0.15]])
@@ -193,12 +205,12 @@ def cyclist() -> Part:
 
 
 def pedestrian(stride: float, swing: float, height: float = 1.75) -> Part:
-    """A walker facing +x.
+    """Returns a walking person.
 
     Args:
-        stride: from foot to foot, metres.
-        swing: how far the hands swing, metres.
-        height: metres.
+        stride: Distance from foot to foot, metres.
+        swing: How far the hands swing, metres.
+        height: Body height, metres.
     """
     start = [[0, -0.1, 0.88], [0, 0.1, 0.88], [stride / 4, -0.1, 0.46], [-stride / 5, 0.1, 0.46]]
     end = [[stride / 4, -0.1, 0.46], [-stride / 5, 0.1, 0.46], [stride / 2, -0.1, 0.03], [-stride / 2, 0.1, 0.06]]
