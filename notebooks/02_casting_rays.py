@@ -1036,7 +1036,7 @@ draw_thread(
 #
 # `kernels.Mesh` wraps that kernel for tensors. What does it do beyond ours? It checks what it is given, takes float64
 # vertices and moves the origin itself, takes directions of any length and any batch shape, and splits a CPU launch over
-# all cores (a launch of Warp itself uses one). `simulate.simulate` turns the rays of a sensor into the world, finds
+# all cores (a launch of Warp itself uses one). `simulate.scan` turns the rays of a sensor into the world, finds
 # their ranges, and leaves out what is nearer than the sensor's `min_range`. Where that is faster on a CPU it does not
 # cast rays at all but projects the triangles onto the image, as a renderer does (`Mesh.project`).
 #

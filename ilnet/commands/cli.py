@@ -117,7 +117,7 @@ def train(
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
 
 
-@cli.command("evaluate")
+@cli.command()
 @click.option(
     "--model", "names", multiple=True, required=True, metavar="NAME|FILE", help="A model to measure; may be repeated."
 )
@@ -135,7 +135,7 @@ def train(
 @click.option(
     "--json", "as_json", is_flag=True, help="Print an object instead of the table, or a list for many models."
 )
-def evaluate_(
+def evaluate(
     names: tuple[str, ...],
     scene: str | None,
     at: Path | None,
@@ -338,15 +338,15 @@ def survey(
         raise click.UsageError("--mesh FILE and --at JSON go together, one each")
     if not (scans or meshes or towns):
         raise click.UsageError("give at least one --scan, --mesh or --town")
-    from ilnet.commands import survey as comparison
+    from ilnet.commands import survey
     from ilnet.world.towns import NAMES
 
-    entries = comparison.compare(scans, zip(meshes, at, strict=True), NAMES if towns == ("all",) else towns)
-    found = "[\n" + ",\n".join(map(json.dumps, comparison.records(entries))) + "\n]"
-    comparison.draw(entries, out / "survey.png")
+    entries = survey.compare(scans, zip(meshes, at, strict=True), NAMES if towns == ("all",) else towns)
+    found = "[\n" + ",\n".join(map(json.dumps, survey.records(entries))) + "\n]"
+    survey.draw(entries, out / "survey.png")
     (out / "survey.json").write_text(found + "\n")
     click.echo(
-        found if as_json else f"{comparison.table(entries)}\n\nfigure and numbers: {out}/survey.png, survey.json"
+        found if as_json else f"{survey.table(entries)}\n\nfigure and numbers: {out}/survey.png, survey.json"
     )
 
 
