@@ -9,6 +9,7 @@ from kernels.neighbour_attention.decoder import DecoderWeights, fused_decode, fu
 from kernels.neighbour_attention.table import Projected, project_pixels
 from kernels.plane_prior import plane_prior
 from kernels.rays.mesh import Hits, Mesh
+from kernels.surfaces import surface_hypotheses, surface_likelihood, surface_median
 
 __all__ = [
     "DecoderWeights",
@@ -24,4 +25,7 @@ __all__ = [
     "neighbour_attention",
     "plane_prior",
     "project_pixels",
+    "surface_hypotheses",
+    "surface_likelihood",
+    "surface_median",
 ]

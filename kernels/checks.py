@@ -5,11 +5,19 @@ from collections.abc import Iterable
 import torch
 
 __all__ = [
+    "AREA_FLOOR",
     "BACKENDS",
+    "BACKGROUND",
+    "CONTINUED",
+    "KINDS",
+    "LEAST_RANGE",
+    "LEAST_SCALE",
     "PARTED",
     "PRIORS",
     "RANGE_FLOOR",
     "SHARPEST",
+    "TOLERANCE",
+    "WIDEST_GAP",
     "broadcast_batch",
     "check_backend",
     "check_floating",
@@ -27,6 +35,23 @@ RANGE_FLOOR = 0.1
 PARTED = 0.03
 # A step that is as sharp or sharper has nothing between.
 SHARPEST = 1e3
+
+# Hypotheses of a neighbour in `kernels.surfaces`: outer, inner or no continuation along its column, and along its row.
+KINDS = 9
+# Least bilinear area in their prior, so that a neighbour can be right where its area is 0.
+AREA_FLOOR = 1e-3
+# Chance that no hypothesis explains a measured range, and the same for a no return.
+BACKGROUND = 1e-3
+# A surface comes nearer or goes farther by this factor at most.
+CONTINUED = 4.0
+# Metres. Measured ranges below are taken as this.
+LEAST_RANGE = 0.01
+# Metres, of the width of a hypothesis.
+LEAST_SCALE = 0.02
+# Radians. No surface is continued over a wider gap.
+WIDEST_GAP = 0.5
+# Metres within which a range counts as right in a confidence.
+TOLERANCE = 0.1
 
 
 def check_floating(name: str, tensor: object, dtypes: Iterable[torch.dtype], shape: str) -> None:

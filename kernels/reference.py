@@ -9,7 +9,18 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
-from kernels.checks import PARTED, RANGE_FLOOR, SHARPEST
+from kernels.checks import (
+    AREA_FLOOR,
+    BACKGROUND,
+    CONTINUED,
+    LEAST_RANGE,
+    LEAST_SCALE,
+    PARTED,
+    RANGE_FLOOR,
+    SHARPEST,
+    TOLERANCE,
+    WIDEST_GAP,
+)
 
 __all__ = [
     "area_blend",
@@ -22,6 +33,9 @@ __all__ = [
     "neighbour_attention",
     "neighbours",
     "plane_prior",
+    "surface_hypotheses",
+    "surface_likelihood",
+    "surface_median",
 ]
 
 
@@ -214,3 +228,92 @@ def cast_rays(
         some = nearest.isfinite()
         results.append((nearest.where(some, 0.0), number.where(some, -1).int(), cosine.where(some, 0.0)))
     return tuple(torch.cat(parts) for parts in zip(*results, strict=True))  # type: ignore[return-value]
+
+
+def _continued(u: torch.Tensor, other: torch.Tensor, gap: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+    """u(α) - u_t of `kernels.surfaces`, Eq. (1), with α and α_o counted from t; 0 where it cannot be continued."""
+    can = (u > 0) & (other > 0) & (gap != 0) & (gap.abs() <= WIDEST_GAP)
+    sine = gap.where(can, 1.0).sin()
+    return ((u * (gap - angle).sin() + other * angle.sin()) / sine - u).where(can, 0.0)
+
+
+def surface_hypotheses(
+    image: torch.Tensor, queries: torch.Tensor, elevations: torch.Tensor, azimuths: torch.Tensor, wrap: bool
+) -> torch.Tensor:
+    """`kernels.surface_hypotheses` on image (B, H, W), queries (B, Q, 2) and both tables."""
+    inverse = (1 / image.clamp(min=LEAST_RANGE)).where(image > 0, 0.0)
+    batch = torch.arange(len(image), device=image.device).view(-1, 1, 1)
+    rows, columns, offsets = neighbours(queries, image.shape[1], image.shape[2], wrap)
+    u = inverse[batch, rows, columns]
+    changes = []
+    for axis, (pixels, table, circle) in enumerate(((rows, elevations, False), (columns, azimuths, wrap))):
+        offset, count = offsets[..., axis], len(table)
+        towards = torch.where(offset < 0, -1, 1)
+        inner, outer = pixels + towards, pixels - towards
+        inner, outer = (p % count if circle else p.clamp(0, count - 1) for p in (inner, outer))
+        gaps = [table[p] - table[pixels] for p in (outer, inner)]
+        if circle:
+            gaps = [gap - math.tau * (gap / math.tau).round() for gap in gaps]
+        spacing = torch.where(inner == pixels, -gaps[0], gaps[1])
+        angle = (offset.abs() * spacing).clamp(-WIDEST_GAP, WIDEST_GAP)
+        others = [inverse[batch, *((p, columns) if axis == 0 else (rows, p))] for p in (outer, inner)]
+        outer_inner = [_continued(u, other, gap, angle) for other, gap in zip(others, gaps, strict=True)]
+        changes.append(torch.stack((*outer_inner, torch.zeros_like(u)), -1))
+    u = u[..., None, None]
+    found = u + changes[0].unsqueeze(-1) + changes[1].unsqueeze(-2)
+    found = torch.minimum(torch.maximum(found, u / CONTINUED), u * CONTINUED)
+    return (1 / found.clamp(min=1e-9)).where(u > 0, 0.0).flatten(-2)
+
+
+def _log_weights(queries: torch.Tensor, scores: torch.Tensor) -> torch.Tensor:
+    """Log w_tk of `kernels.surfaces`, Eq. (3), (B, Q, 4, 9)."""
+    prior = areas(queries).clamp(min=AREA_FLOOR).log()
+    return (scores + prior.unsqueeze(-1)).flatten(-2).log_softmax(-1).view(scores.shape)
+
+
+def surface_likelihood(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    elevations: torch.Tensor,
+    azimuths: torch.Tensor,
+    wrap: bool,
+    scores: torch.Tensor,
+    scales: torch.Tensor,
+    targets: torch.Tensor,
+    far: float,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """`kernels.surface_likelihood`, shapes as in `surface_hypotheses`."""
+    found = surface_hypotheses(image, queries, elevations, azimuths, wrap)
+    w = _log_weights(queries, scores).exp()
+    b = (0.5 * F.softplus(scales) + LEAST_SCALE).unsqueeze(-1)
+    r = targets[..., None, None]
+    error = (found.where(found > 0, far) - r.where(r > 0, far)).abs()
+    p = torch.where(r > 0, (-error / b).exp() / (2 * b), 1.0).where((found > 0) == (r > 0), 0.0)
+    background = torch.where(targets > 0, BACKGROUND / far, BACKGROUND)
+    likelihood = -((1 - 2 * BACKGROUND) * (w * p).flatten(-2).sum(-1) + background).log()
+    return likelihood, (w * error).flatten(-2).sum(-1)
+
+
+def surface_median(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    elevations: torch.Tensor,
+    azimuths: torch.Tensor,
+    wrap: bool,
+    scores: torch.Tensor,
+    scales: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """`kernels.surface_median`, shapes as in `surface_hypotheses`."""
+    found = surface_hypotheses(image, queries, elevations, azimuths, wrap)
+    w = _log_weights(queries, scores).exp()
+    r, order = found.where(found > 0, math.inf).flatten(-2).sort(-1)
+    below = w.flatten(-2).gather(-1, order).cumsum(-1)
+    median = r.gather(-1, (below < 0.5).sum(-1, keepdim=True).clamp(max=r.shape[-1] - 1)).unsqueeze(-1)
+    none = w.where(found == 0, 0.0).flatten(-2).sum(-1)
+    b = (0.5 * F.softplus(scales) + LEAST_SCALE).unsqueeze(-1)
+    ends = [(median - found + side).where(median.isfinite(), 0.0) / b for side in (-TOLERANCE, TOLERANCE)]
+    low, high = (torch.where(x < 0, 0.5 * x.clamp(max=0).exp(), 1 - 0.5 * (-x).clamp(max=0).exp()) for x in ends)
+    near = (w * (high - low)).where(found > 0, 0.0).flatten(-2).sum(-1)
+    median = median.flatten(-3)
+    confidence = near.where(median.isfinite(), none)
+    return median.where(median.isfinite(), 0.0), (1 - 2 * BACKGROUND) * confidence, (1 - 2 * BACKGROUND) * none

@@ -20,6 +20,7 @@ MODULES = [
     "rays.mesh",
     "rays.projection",
     "scatter",
+    "surfaces",
 ]
 
 

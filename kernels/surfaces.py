@@ -1,0 +1,712 @@
+"""surfaces: where the surfaces of the 4 neighbours of a query are met along it, and how likely each of these is.
+
+The inverse range u = 1/r of a plane is A cos α + B sin α along a row or a column of the range image, α being the angle
+from pixel to pixel. Two pixels t and o therefore tell the whole of it, at any angle α of a query:
+
+    u(α) = (u_t sin(α_o - α) + u_o sin(α - α_t)) / sin(α_o - α_t)                                                    (1)
+
+Each neighbour t lies on a surface that can be continued to the query in three ways along its column and in three ways
+along its row: with the *outer* pixel, the one beyond t as seen from the query; with the *inner* one, across the query;
+or not at all, since t may be all there is of its surface. Changes along the column and along the row add up. That makes
+9 hypotheses a neighbour and K = 36 a query:
+
+    u_tk = u_t + (u_v(α_v) - u_t) + (u_h(α_h) - u_t),    r_tk = 1 / u_tk,    u_t / 4 <= u_tk <= 4 u_t                (2)
+
+A pixel without a return cannot be continued, nor can another be continued with it, nor over a gap of more than 0.5 rad:
+then u(α) = u_t. All hypotheses of a neighbour without a return are that there is none.
+
+A network gives each hypothesis a score s_tk and each neighbour a scale c_t; with the bilinear areas a_t as a prior
+
+    w_tk = softmax(s_tk + log max(a_t, 0.001)),    b_t = 0.5 log(1 + exp c_t) + 0.02 m                               (3)
+
+The range r of a query then is a mixture of Laplace distributions, and of the chance that nothing returns:
+
+    p(r) = (1 - 2 ε) Σ_tk w_tk exp(-|r_tk - r| / b_t) / 2 b_t + ε / R      over the hypotheses that return,          (4)
+    p(none) = (1 - 2 ε) Σ_tk w_tk + ε                                      over those that do not
+
+with ε = 0.001 for what no neighbour tells, and R for the range that a no return counts as. The answer is the weighted
+median of the r_tk, a no return being farthest. It has the least expected absolute error, and it *is* one of the
+hypotheses, so that nothing floats between two surfaces.
+"""
+
+from typing import Any
+
+import torch
+import warp as wp
+
+from kernels import reference
+from kernels.checks import (
+    AREA_FLOOR,
+    BACKGROUND,
+    CONTINUED,
+    KINDS,
+    LEAST_RANGE,
+    LEAST_SCALE,
+    TOLERANCE,
+    WIDEST_GAP,
+    broadcast_batch,
+    check_backend,
+    check_floating,
+    check_queries,
+)
+from kernels.lanes import exp2
+from kernels.launch import launch, overload
+from kernels.stencil import area, base, column_of, query_of
+from kernels.vmap import refuse
+
+__all__ = ["surface_hypotheses", "surface_likelihood", "surface_median"]
+
+_AREA_FLOOR = wp.constant(AREA_FLOOR)
+_BACKGROUND = wp.constant(BACKGROUND)
+_CONTINUED = wp.constant(CONTINUED)
+_LEAST_RANGE = wp.constant(LEAST_RANGE)
+_LEAST_SCALE = wp.constant(LEAST_SCALE)
+_TOLERANCE = wp.constant(TOLERANCE)
+_WIDEST_GAP = wp.constant(WIDEST_GAP)
+_TURN = wp.constant(6.283185307179586)
+
+_many = wp.types.vector(4 * KINDS, wp.Float)
+_four = wp.types.vector(4, wp.Float)
+
+
+@wp.func
+def _sine(x: Any):
+    """The sine of |x| <= 1 to 3e-8; far faster than `wp.sin`, which no CPU compiler turns into SIMD instructions."""
+    s = x * x
+    p = type(x)(2.7557319e-6) * s - type(x)(1.984126984e-4)
+    p = p * s + type(x)(8.333333333e-3)
+    p = p * s - type(x)(0.16666666667)
+    return x + x * s * p
+
+
+@wp.func
+def _gap(table: wp.array[Any], index: int, other: int, wrap: int):
+    """The angle from pixel `index` to pixel `other` of a row or column, the short way round on a full circle."""
+    gap = table[other] - table[index]
+    if wrap != 0:
+        turn = type(gap)(_TURN)
+        gap = gap - turn * wp.round(gap / turn)
+    return gap
+
+
+@wp.func
+def _continue(gap: Any, angle: Any):
+    """What u_t and u_o are multiplied by in u(α) - u_t, with α and α_o counted from t; Eq. (1)."""
+    if gap == type(gap)(0.0) or wp.abs(gap) > type(gap)(_WIDEST_GAP):
+        return type(gap)(0.0), type(gap)(0.0)
+    sine = _sine(gap)
+    return _sine(gap - angle) / sine - type(gap)(1.0), _sine(angle) / sine
+
+
+@wp.func
+def _along(coordinate: Any, side: int, table: wp.array[Any], wrap: int):
+    """Along one axis, for the neighbours on one side of a query: pixel, outer and inner pixel, and their factors."""
+    count = table.shape[0]
+    unbounded = base(coordinate) + side
+    if wrap == 0:
+        unbounded = wp.clamp(unbounded, 0, count - 1)
+    offset = coordinate - type(coordinate)(unbounded)
+    towards = wp.where(offset < type(coordinate)(0.0), -1, 1)
+    t = column_of(unbounded, count, wrap)
+    inner = column_of(unbounded + towards, count, wrap)
+    outer = column_of(unbounded - towards, count, wrap)
+    inner_gap = _gap(table, t, inner, wrap)
+    outer_gap = _gap(table, t, outer, wrap)
+    # Beyond the table its last spacing goes on, as in `Sensor.locate`.
+    spacing = wp.where(inner == t, -outer_gap, inner_gap)
+    limit = type(coordinate)(_WIDEST_GAP)
+    angle = wp.clamp(wp.abs(offset) * spacing, -limit, limit)
+    a_outer, b_outer = _continue(outer_gap, angle)
+    a_inner, b_inner = _continue(inner_gap, angle)
+    return t, outer, inner, a_outer, b_outer, a_inner, b_inner
+
+
+@wp.func
+def _inverse(image: wp.array3d[Any], b: int, i: int, j: int):
+    """U of a pixel; 0 where nothing returned."""
+    r = image[b, i, j]
+    one = type(r)(1.0)
+    return wp.where(r > type(r)(0.0), one / wp.max(r, type(r)(_LEAST_RANGE)), type(r)(0.0))
+
+
+@wp.func
+def _change(u: Any, other: Any, a: Any, b: Any):
+    """u(α) - u_t; 0 where one of the pixels has no return."""
+    zero = type(u)(0.0)
+    return wp.where(u > zero and other > zero, u * a + other * b, zero)
+
+
+@wp.func
+def _hypotheses(
+    image: wp.array3d[Any],
+    b: int,
+    row: Any,
+    column: Any,
+    elevations: wp.array[Any],
+    azimuths: wp.array[Any],
+    wrap: int,
+    zeros: Any,
+):
+    """The ranges r_tk of a query, number 9 t + 3 v + h for continuation v along the column and h along the row.
+
+    Continuations are 0, outer; 1, inner; 2, none. No return is 0.
+    """
+    found = zeros
+    zero = type(row)(0.0)
+    within = type(row)(_CONTINUED)
+    v = wp.vector(length=3, dtype=type(row))
+    h = wp.vector(length=3, dtype=type(row))
+    for t in range(4):
+        i, i_outer, i_inner, a_outer, b_outer, a_inner, b_inner = _along(row, t // 2, elevations, 0)
+        j, j_outer, j_inner, c_outer, d_outer, c_inner, d_inner = _along(column, t % 2, azimuths, wrap)
+        u = _inverse(image, b, i, j)
+        v[0] = _change(u, _inverse(image, b, i_outer, j), a_outer, b_outer)
+        v[1] = _change(u, _inverse(image, b, i_inner, j), a_inner, b_inner)
+        h[0] = _change(u, _inverse(image, b, i, j_outer), c_outer, d_outer)
+        h[1] = _change(u, _inverse(image, b, i, j_inner), c_inner, d_inner)
+        for k in range(9):
+            x = wp.clamp(u + v[k // 3] + h[k % 3], u / within, u * within)
+            found[9 * t + k] = wp.where(u > zero, type(row)(1.0) / wp.max(x, type(row)(1.0e-9)), zero)
+    return found
+
+
+@wp.func
+def _weigh(scores: Any, row: Any, column: Any):
+    """The weights of Eq. (3), up to a common factor."""
+    one = type(row)(1.0)
+    largest = scores[0]
+    for k in range(len(scores)):
+        largest = wp.max(largest, scores[k])
+    w = scores
+    for k in range(len(scores)):
+        w[k] = (scores[k] - largest) * type(row)(1.4426950408889634)
+    w = exp2(w)
+    for t in range(4):
+        a = wp.max(area(row, column, t), one * type(row)(_AREA_FLOOR))
+        for k in range(9):
+            w[9 * t + k] = w[9 * t + k] * a
+    return w
+
+
+@wp.func
+def _scale(c: Any):
+    """b_t of Eq. (3)."""
+    softplus = wp.max(c, type(c)(0.0)) + wp.log(type(c)(1.0) + wp.exp(-wp.abs(c)))
+    return type(c)(0.5) * softplus + type(c)(_LEAST_SCALE)
+
+
+@wp.func
+def _explain(found: Any, scales: Any, target: Any, far: Any):
+    """What each hypothesis says of a measured range: its density or probability, and the error; Eq. (4)."""
+    zero = type(target)(0.0)
+    gap = found
+    p = found
+    for k in range(len(found)):
+        gap[k] = wp.abs(wp.where(found[k] > zero, found[k], far) - wp.where(target > zero, target, far))
+    for t in range(4):
+        b = _scale(scales[t])
+        for k in range(9):
+            p[9 * t + k] = gap[9 * t + k] / b * type(target)(-1.4426950408889634)
+    p = exp2(p)
+    for t in range(4):
+        half = type(target)(0.5) / _scale(scales[t])
+        for k in range(9):
+            p[9 * t + k] = p[9 * t + k] * wp.where(target > zero, half, type(target)(1.0))
+    for k in range(len(found)):
+        p[k] = wp.where((found[k] > zero) == (target > zero), p[k], zero)
+    return p, gap
+
+
+@wp.kernel(enable_backward=False)
+def _hypotheses_kernel(
+    first: int,
+    # in
+    image: wp.array3d[wp.Float],
+    queries: wp.array3d[wp.Float],
+    elevations: wp.array[wp.Float],
+    azimuths: wp.array[wp.Float],
+    wrap: int,
+    # out
+    found_out: wp.array2d[_many],
+):
+    b, q = query_of(first + wp.tid(), queries.shape[1])
+    found_out[b, q] = _hypotheses(
+        image, b, queries[b, q, 0], queries[b, q, 1], elevations, azimuths, wrap, found_out.dtype()
+    )
+
+
+@wp.kernel(enable_backward=False)
+def _likelihood_kernel(
+    first: int,
+    # in
+    image: wp.array3d[wp.Float],
+    queries: wp.array3d[wp.Float],
+    elevations: wp.array[wp.Float],
+    azimuths: wp.array[wp.Float],
+    wrap: int,
+    scores: wp.array2d[_many],
+    scales: wp.array2d[_four],
+    targets: wp.array2d[wp.Float],
+    far: wp.Float,
+    # out
+    likelihood_out: wp.array2d[wp.Float],
+    error_out: wp.array2d[wp.Float],
+):
+    b, q = query_of(first + wp.tid(), queries.shape[1])
+    row = queries[b, q, 0]
+    column = queries[b, q, 1]
+    target = targets[b, q]
+    w = _weigh(scores[b, q], row, column)
+    found = _hypotheses(image, b, row, column, elevations, azimuths, wrap, scores.dtype())
+    p, gap = _explain(found, scales[b, q], target, far)
+    background = type(far)(_BACKGROUND)
+    whole = type(far)(0.0)
+    explained = type(far)(0.0)
+    error = type(far)(0.0)
+    for k in range(len(w)):
+        whole = whole + w[k]
+        explained = explained + w[k] * p[k]
+        error = error + w[k] * gap[k]
+    unexplained = wp.where(target > type(far)(0.0), background / far, background)
+    likelihood_out[b, q] = -wp.log((type(far)(1.0) - type(far)(2.0) * background) * explained / whole + unexplained)
+    error_out[b, q] = error / whole
+
+
+@wp.kernel(enable_backward=False)
+def _likelihood_backward_kernel(
+    first: int,
+    # in
+    image: wp.array3d[wp.Float],
+    queries: wp.array3d[wp.Float],
+    elevations: wp.array[wp.Float],
+    azimuths: wp.array[wp.Float],
+    wrap: int,
+    scores: wp.array2d[_many],
+    scales: wp.array2d[_four],
+    targets: wp.array2d[wp.Float],
+    far: wp.Float,
+    adj_likelihood: wp.array2d[wp.Float],
+    adj_error: wp.array2d[wp.Float],
+    # out
+    adj_scores_out: wp.array2d[_many],
+    adj_scales_out: wp.array2d[_four],
+):
+    b, q = query_of(first + wp.tid(), queries.shape[1])
+    row = queries[b, q, 0]
+    column = queries[b, q, 1]
+    target = targets[b, q]
+    w = _weigh(scores[b, q], row, column)
+    found = _hypotheses(image, b, row, column, elevations, azimuths, wrap, scores.dtype())
+    p, gap = _explain(found, scales[b, q], target, far)
+    zero = type(far)(0.0)
+    one = type(far)(1.0)
+    background = type(far)(_BACKGROUND)
+    whole = zero
+    for k in range(len(w)):
+        whole = whole + w[k]
+    explained = zero
+    error = zero
+    for k in range(len(w)):
+        w[k] = w[k] / whole
+        explained = explained + w[k] * p[k]
+        error = error + w[k] * gap[k]
+    unexplained = wp.where(target > zero, background / far, background)
+    known = one - type(far)(2.0) * background
+    factor = known / (known * explained + unexplained) * adj_likelihood[b, q]
+    adj_scores = scores.dtype()
+    for k in range(len(w)):
+        adj_scores[k] = w[k] * (adj_error[b, q] * (gap[k] - error) - factor * (p[k] - explained))
+    adj_scores_out[b, q] = adj_scores
+    adj_scales = scales.dtype()
+    for t in range(4):
+        c = scales[b, q][t]
+        inverse = one / _scale(c)
+        total = zero
+        for k in range(9):
+            total = total + w[9 * t + k] * p[9 * t + k] * (gap[9 * t + k] * inverse - one) * inverse
+        slope = type(far)(0.5) / (one + wp.exp(-c))  # of b_t in c_t
+        adj_scales[t] = wp.where(target > zero, -factor * total * slope, zero)
+    adj_scales_out[b, q] = adj_scales
+
+
+@wp.func
+def _mass(x: Any):
+    """The Laplace distribution function."""
+    half = type(x)(0.5) * wp.exp(-wp.abs(x))
+    return wp.where(x < type(x)(0.0), half, type(x)(1.0) - half)
+
+
+@wp.func
+def settle(found: Any, w: Any, scales: Any):
+    """The weighted median of hypotheses, 0 for no return, how much to trust it, and the chance of no return."""
+    zero = type(scales[0])(0.0)
+    infinite = type(scales[0])(wp.inf)
+    r = found
+    whole = zero
+    none = zero
+    for k in range(len(found)):
+        r[k] = wp.where(found[k] > zero, found[k], infinite)
+        whole = whole + w[k]
+        none = none + wp.where(found[k] > zero, zero, w[k])
+    # Weight of all that is no farther, of every hypothesis at once: a sort in no order, without a branch.
+    below = type(found)()
+    for j in range(len(found)):
+        for k in range(len(found)):
+            below[k] = below[k] + wp.where(r[j] <= r[k], w[j], zero)
+    median = infinite
+    for k in range(len(found)):
+        median = wp.min(median, wp.where(below[k] >= type(zero)(0.5) * whole, r[k], infinite))
+    trusted = none
+    if median < infinite:
+        trusted = zero
+        for t in range(4):
+            inverse = type(zero)(1.0) / _scale(scales[t])
+            for k in range(9):
+                x = r[9 * t + k]
+                if x < infinite:
+                    near = _mass((median - x + type(zero)(_TOLERANCE)) * inverse)
+                    near = near - _mass((median - x - type(zero)(_TOLERANCE)) * inverse)
+                    trusted = trusted + w[9 * t + k] * near
+    else:
+        median = zero
+    known = (type(zero)(1.0) - type(zero)(2.0) * type(zero)(_BACKGROUND)) / whole
+    return median, trusted * known, none * known
+
+
+@wp.kernel(enable_backward=False)
+def _median_kernel(
+    first: int,
+    # in
+    image: wp.array3d[wp.Float],
+    queries: wp.array3d[wp.Float],
+    elevations: wp.array[wp.Float],
+    azimuths: wp.array[wp.Float],
+    wrap: int,
+    scores: wp.array2d[_many],
+    scales: wp.array2d[_four],
+    # out
+    ranges_out: wp.array2d[wp.Float],
+    confidence_out: wp.array2d[wp.Float],
+    none_out: wp.array2d[wp.Float],
+):
+    b, q = query_of(first + wp.tid(), queries.shape[1])
+    row = queries[b, q, 0]
+    column = queries[b, q, 1]
+    w = _weigh(scores[b, q], row, column)
+    found = _hypotheses(image, b, row, column, elevations, azimuths, wrap, scores.dtype())
+    median, confidence, none = settle(found, w, scales[b, q])
+    ranges_out[b, q] = median
+    confidence_out[b, q] = confidence
+    none_out[b, q] = none
+
+
+_found = overload(_hypotheses_kernel)
+_likelihood = overload(_likelihood_kernel)
+_likelihood_backward = overload(_likelihood_backward_kernel)
+_median = overload(_median_kernel)
+
+
+@torch.library.custom_op("kernels::surface_hypotheses", mutates_args=())
+def _surface_hypotheses(
+    image: torch.Tensor, queries: torch.Tensor, elevations: torch.Tensor, azimuths: torch.Tensor, wrap: bool
+) -> torch.Tensor:
+    batch, count, _ = queries.shape
+    found = image.new_empty(batch, count, 4, KINDS)
+    inputs = [image, queries, elevations, azimuths, int(wrap)]
+    launch(_found[image.dtype], batch * count, inputs, [found])
+    return found
+
+
+@_surface_hypotheses.register_fake
+def _(
+    image: torch.Tensor, queries: torch.Tensor, elevations: torch.Tensor, azimuths: torch.Tensor, wrap: bool
+) -> torch.Tensor:
+    return image.new_empty(queries.shape[0], queries.shape[1], 4, KINDS)
+
+
+@torch.library.custom_op("kernels::surface_likelihood", mutates_args=())
+def _surface_likelihood(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    elevations: torch.Tensor,
+    azimuths: torch.Tensor,
+    wrap: bool,
+    scores: torch.Tensor,
+    scales: torch.Tensor,
+    targets: torch.Tensor,
+    far: float,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    likelihood, error = torch.empty_like(targets), torch.empty_like(targets)
+    inputs = [image, queries, elevations, azimuths, int(wrap), scores, scales, targets, far]
+    launch(_likelihood[image.dtype], targets.numel(), inputs, [likelihood, error])
+    return likelihood, error
+
+
+@_surface_likelihood.register_fake
+def _(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    elevations: torch.Tensor,
+    azimuths: torch.Tensor,
+    wrap: bool,
+    scores: torch.Tensor,
+    scales: torch.Tensor,
+    targets: torch.Tensor,
+    far: float,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.empty_like(targets), torch.empty_like(targets)
+
+
+@torch.library.custom_op("kernels::surface_likelihood_backward", mutates_args=())
+def _surface_likelihood_backward(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    elevations: torch.Tensor,
+    azimuths: torch.Tensor,
+    wrap: bool,
+    scores: torch.Tensor,
+    scales: torch.Tensor,
+    targets: torch.Tensor,
+    far: float,
+    adj_likelihood: torch.Tensor,
+    adj_error: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    adj_scores, adj_scales = torch.empty_like(scores), torch.empty_like(scales)
+    inputs = [image, queries, elevations, azimuths, int(wrap), scores, scales, targets, far, adj_likelihood, adj_error]
+    launch(_likelihood_backward[image.dtype], targets.numel(), inputs, [adj_scores, adj_scales])
+    return adj_scores, adj_scales
+
+
+@_surface_likelihood_backward.register_fake
+def _(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    elevations: torch.Tensor,
+    azimuths: torch.Tensor,
+    wrap: bool,
+    scores: torch.Tensor,
+    scales: torch.Tensor,
+    targets: torch.Tensor,
+    far: float,
+    adj_likelihood: torch.Tensor,
+    adj_error: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.empty_like(scores), torch.empty_like(scales)
+
+
+def _setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
+    *tensors, ctx.far = inputs
+    ctx.wrap = tensors.pop(4)
+    ctx.save_for_backward(*tensors)
+
+
+def _backward(ctx: Any, adj_likelihood: torch.Tensor, adj_error: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    *rays, scores, scales, targets = ctx.saved_tensors
+    adj_scores, adj_scales = _surface_likelihood_backward(
+        *rays, ctx.wrap, scores, scales, targets, ctx.far, adj_likelihood.contiguous(), adj_error.contiguous()
+    )
+    return None, None, None, None, None, adj_scores, adj_scales, None, None
+
+
+_surface_likelihood.register_autograd(_backward, setup_context=_setup_context)
+
+
+@torch.library.custom_op("kernels::surface_median", mutates_args=())
+def _surface_median(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    elevations: torch.Tensor,
+    azimuths: torch.Tensor,
+    wrap: bool,
+    scores: torch.Tensor,
+    scales: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    shape = queries.shape[:2]
+    ranges, confidence, none = image.new_empty(shape), image.new_empty(shape), image.new_empty(shape)
+    inputs = [image, queries, elevations, azimuths, int(wrap), scores, scales]
+    launch(_median[image.dtype], ranges.numel(), inputs, [ranges, confidence, none])
+    return ranges, confidence, none
+
+
+@_surface_median.register_fake
+def _(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    elevations: torch.Tensor,
+    azimuths: torch.Tensor,
+    wrap: bool,
+    scores: torch.Tensor,
+    scales: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    shape = queries.shape[:2]
+    return image.new_empty(shape), image.new_empty(shape), image.new_empty(shape)
+
+
+for _op in (_surface_hypotheses, _surface_likelihood, _surface_median):
+    refuse(_op, "its image and queries have a batch dimension for that")
+refuse(_surface_likelihood_backward, "ask for one gradient at a time")
+
+
+def surface_hypotheses(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    elevations: torch.Tensor,
+    azimuths: torch.Tensor,
+    wrap: bool = True,
+    backend: str = "warp",
+) -> torch.Tensor:
+    """Finds where the surfaces of the 4 neighbours of each query, continued in 9 ways each, are met along it.
+
+    It carries no gradient: ranges are measured.
+
+    Args:
+        image: (..., H, W) float32 or float64 ranges in metres, 0 where nothing returned.
+        queries: (..., Q, 2) pixel coordinates (row, column). Leading dimensions broadcast against those of `image`.
+        elevations: (H,) radians, of the rows; any spacing.
+        azimuths: (W,) radians, of the columns; any spacing.
+        wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
+        backend: "warp", or "torch" for the plain twin in `kernels.reference`.
+
+    Returns:
+        (..., Q, 4, 9) metres, 0 for no return; neighbours in the order (row-, col-), (row-, col+), (row+, col-),
+        (row+, col+), for each of them 3 v + h, continued along the column as v says and along the row as h says:
+        0, with the outer pixel; 1, with the inner one; 2, not at all.
+
+    Raises:
+        TypeError: If an argument is not a floating-point tensor of a supported dtype.
+        ValueError: If a shape, device or backend does not fit.
+
+    Source: ours, Eq. (2) of `kernels.surfaces`.
+    """
+    batch, image, queries, tables = _rays(image, queries, elevations, azimuths, backend)
+    op = reference.surface_hypotheses if backend == "torch" else _surface_hypotheses
+    return op(image, queries, *tables, wrap).view(*batch, -1, 4, KINDS)
+
+
+def surface_likelihood(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    elevations: torch.Tensor,
+    azimuths: torch.Tensor,
+    scores: torch.Tensor,
+    scales: torch.Tensor,
+    targets: torch.Tensor,
+    far: float,
+    wrap: bool = True,
+    backend: str = "warp",
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Tells how well scores and scales explain the ranges that were measured along the queries.
+
+    Differentiable in `scores` and `scales`.
+
+    Args:
+        image: (..., H, W) float32 or float64 ranges in metres, 0 where nothing returned.
+        queries: (..., Q, 2) pixel coordinates (row, column). Leading dimensions broadcast against those of `image`.
+        elevations: (H,) radians, of the rows; any spacing.
+        azimuths: (W,) radians, of the columns; any spacing.
+        scores: (..., Q, 4, 9), s_tk of the hypotheses of `surface_hypotheses`.
+        scales: (..., Q, 4), c_t of the neighbours.
+        targets: (..., Q) measured ranges in metres, 0 where nothing returned.
+        far: R, the metres that a no return counts as.
+        wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
+        backend: "warp", or "torch" for the plain twin in `kernels.reference`.
+
+    Returns:
+        likelihood: (..., Q), -log p of Eq. (4).
+        error: (..., Q) metres, the expected absolute error Σ_tk w_tk |r_tk - r|.
+
+    Raises:
+        TypeError: If an argument is not a floating-point tensor of a supported dtype.
+        ValueError: If a shape, device, `far` or backend does not fit.
+
+    Source: ours, Eqs. (3) and (4) of `kernels.surfaces`.
+    """
+    if not far > 0:
+        raise ValueError(f"far is {far}; it should be a number of metres above 0")
+    batch, image, queries, tables = _rays(image, queries, elevations, azimuths, backend)
+    count = queries.shape[1]
+    scores = _of_queries("scores", scores, batch, (count, 4, KINDS), image)
+    scales = _of_queries("scales", scales, batch, (count, 4), image)
+    targets = _of_queries("targets", targets.detach(), batch, (count,), image)
+    op = reference.surface_likelihood if backend == "torch" else _surface_likelihood
+    likelihood, error = op(image, queries, *tables, wrap, scores, scales, targets, float(far))
+    return likelihood.view(*batch, count), error.view(*batch, count)
+
+
+def surface_median(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    elevations: torch.Tensor,
+    azimuths: torch.Tensor,
+    scores: torch.Tensor,
+    scales: torch.Tensor,
+    wrap: bool = True,
+    backend: str = "warp",
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Answers queries with the weighted median of their hypotheses. For inference: no gradients.
+
+    Args:
+        image: (..., H, W) float32 or float64 ranges in metres, 0 where nothing returned.
+        queries: (..., Q, 2) pixel coordinates (row, column). Leading dimensions broadcast against those of `image`.
+        elevations: (H,) radians, of the rows; any spacing.
+        azimuths: (W,) radians, of the columns; any spacing.
+        scores: (..., Q, 4, 9), s_tk of the hypotheses of `surface_hypotheses`.
+        scales: (..., Q, 4), c_t of the neighbours.
+        wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
+        backend: "warp", or "torch" for the plain twin in `kernels.reference`.
+
+    Returns:
+        ranges: (..., Q) metres, 0 for no return.
+        confidence: (..., Q), the probability that the answer is right: to 10 cm, or in that nothing returns.
+        no_return: (..., Q), the probability that nothing returns.
+
+    Raises:
+        TypeError: If an argument is not a floating-point tensor of a supported dtype.
+        ValueError: If a shape, device or backend does not fit.
+
+    Source: ours, see `kernels.surfaces`.
+    """
+    batch, image, queries, tables = _rays(image, queries, elevations, azimuths, backend)
+    count = queries.shape[1]
+    scores = _of_queries("scores", scores.detach(), batch, (count, 4, KINDS), image)
+    scales = _of_queries("scales", scales.detach(), batch, (count, 4), image)
+    op = reference.surface_median if backend == "torch" else _surface_median
+    ranges, confidence, none = op(image, queries, *tables, wrap, scores, scales)
+    return ranges.view(*batch, count), confidence.view(*batch, count), none.view(*batch, count)
+
+
+def _rays(
+    image: torch.Tensor, queries: torch.Tensor, elevations: torch.Tensor, azimuths: torch.Tensor, backend: str
+) -> tuple[torch.Size, torch.Tensor, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+    """Checks what all these ops take, and folds leading dimensions into one."""
+    check_backend(backend)
+    check_floating("image", image, list(_found), "(..., H, W)")
+    if image.ndim < 2 or 0 in image.shape[-2:]:
+        raise ValueError(f"image has shape {tuple(image.shape)}; it should be (..., H, W), neither of them 0")
+    check_queries(queries, image, "image")
+    tables = []
+    for name, table, count in (
+        ("elevations", elevations, image.shape[-2]),
+        ("azimuths", azimuths, image.shape[-1]),
+    ):
+        check_floating(name, table, [torch.float32, torch.float64], f"({count},)")
+        if table.shape != (count,):
+            raise ValueError(f"{name} has shape {tuple(table.shape)}; it should be ({count},), as the image has it")
+        if table.device != image.device:
+            raise ValueError(f"{name} is on {table.device}, image on {image.device}; they should be on one device")
+        tables.append(table.detach().to(image.dtype).contiguous())
+    queries = queries.detach().to(image.dtype)
+    batch, (image, queries) = broadcast_batch(image=(image.detach(), 2), queries=(queries, 2))
+    return batch, image.contiguous(), queries.contiguous(), (tables[0], tables[1])
+
+
+def _of_queries(
+    name: str, tensor: torch.Tensor, batch: torch.Size, shape: tuple[int, ...], image: torch.Tensor
+) -> torch.Tensor:
+    """Checks what each query has one of, and folds its leading dimensions into one."""
+    check_floating(name, tensor, [torch.float32, torch.float64, torch.bfloat16, torch.float16], "of the queries")
+    if tensor.shape != (*batch, *shape):
+        raise ValueError(f"{name} has shape {tuple(tensor.shape)}; it should be {(*batch, *shape)}")
+    if tensor.device != image.device:
+        raise ValueError(f"{name} is on {tensor.device}, image on {image.device}; they should be on one device")
+    return tensor.to(image.dtype).reshape(len(image), *shape).contiguous()
