@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.checks import broadcast_batch, check_backend, check_floating, check_queries
+from kernels.checks import broadcast_batch, check_backend, check_devices, check_floating, check_queries
 from kernels.launch import BLOCKS, launch, overload, query_blocks
 from kernels.stencil import area
 from kernels.vmap import fold_into_batch
@@ -135,7 +135,8 @@ def area_blend(values: torch.Tensor, queries: torch.Tensor, backend: str = "warp
     """
     check_backend(backend)
     check_floating("values", values, [dtype for dtype, n in _blend if n == 1], "(..., Q, 4)")
-    check_queries(queries, values, "values")
+    check_queries(queries)
+    check_devices(values=values, queries=queries)
     if values.ndim < 2 or values.shape[-2:] != (queries.shape[-2], 4):
         raise ValueError(f"values has shape {tuple(values.shape)}; it should be (..., {queries.shape[-2]}, 4)")
     queries = queries.detach().to(torch.promote_types(values.dtype, torch.float32))

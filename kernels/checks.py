@@ -1,4 +1,10 @@
-"""What every op asks of its arguments, and the constants that ops and their plain twins share."""
+"""What every op asks of its arguments, and the constants that ops share with their plain PyTorch twins.
+
+A public op checks its arguments first, with `check_backend`, `check_floating` (type and dtype), `check_queries` and
+`check_devices`. Then `broadcast_batch` gives all its tensors one batch dimension. Behind that point nothing is checked
+again, except that `kernels.launch.launch` compares devices. An error names the argument, what it is, and what it should
+be.
+"""
 
 from collections.abc import Iterable
 
@@ -20,6 +26,7 @@ __all__ = [
     "WIDEST_GAP",
     "broadcast_batch",
     "check_backend",
+    "check_devices",
     "check_floating",
     "check_queries",
 ]
@@ -28,12 +35,12 @@ BACKENDS = ("warp", "torch")
 
 PRIORS = ("none", "bilinear", "perspective")
 
-# Metres. The perspective prior divides by range; no LiDAR measures below this.
+# Metres. The perspective prior divides by range, and no LiDAR measures below this.
 RANGE_FLOOR = 0.1
-# Two inverse ranges that differ by more than this share of the smaller one are not of one surface. Of 0.015, 0.03, 0.05
-# and 0.1, what gave `plane_prior` the highest IoU at 128x2048 on scans held out of the training towns.
+# Two inverse ranges that differ by more than this share of the smaller one belong to different surfaces. Of 0.015,
+# 0.03, 0.05 and 0.1, this gave `plane_prior` the highest IoU at 128x2048 on scans held out of the training towns.
 PARTED = 0.03
-# A step that is as sharp or sharper has nothing between.
+# From this sharpness on, a step jumps from 0 to 1 without values between.
 SHARPEST = 1e3
 
 # Hypotheses of a neighbour in `kernels.surfaces`: outer, inner or no continuation along its column, and along its row.
@@ -69,18 +76,30 @@ def check_backend(backend: str) -> None:
         raise ValueError(f"backend is {backend!r}; it should be one of {', '.join(BACKENDS)}")
 
 
-def check_queries(queries: torch.Tensor, like: torch.Tensor, name: str) -> None:
-    """Raises unless `queries` is a floating (..., Q, 2) tensor on the device of `like`, the argument called `name`."""
+def check_devices(**tensors: torch.Tensor) -> None:
+    """Raises ValueError unless all tensors are on one device, whose index counts: cuda:0 is not cuda:1.
+
+    Args:
+        **tensors: The tensors by the names of the arguments.
+    """
+    first, device = None, None
+    for name, tensor in tensors.items():
+        if device is None:
+            first, device = name, tensor.device
+        elif tensor.device != device:
+            raise ValueError(f"{name} is on {tensor.device}; it should be on {device}, where {first} is")
+
+
+def check_queries(queries: torch.Tensor) -> None:
+    """Raises unless `queries` is a floating-point tensor (..., Q, 2)."""
     if not isinstance(queries, torch.Tensor):
-        raise TypeError(f"queries is a {type(queries).__name__}; it should be a torch.Tensor (..., Q, 2)")
+        raise TypeError(f"queries is {type(queries).__name__}; it should be a torch.Tensor (..., Q, 2)")
     if queries.ndim < 2 or queries.shape[-1] != 2:
         raise ValueError(
             f"queries has shape {tuple(queries.shape)}; it should be (..., Q, 2): row and column in pixels"
         )
     if not queries.is_floating_point():
         raise TypeError(f"queries is {queries.dtype}; it should be a floating-point tensor of pixel coordinates")
-    if queries.device != like.device:
-        raise ValueError(f"queries is on {queries.device}, {name} on {like.device}; they should be on one device")
 
 
 def broadcast_batch(**named: tuple[torch.Tensor, int]) -> tuple[torch.Size, list[torch.Tensor]]:

@@ -6,10 +6,10 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.checks import broadcast_batch, check_backend, check_floating, check_queries
+from kernels.checks import broadcast_batch, check_backend, check_devices, check_floating, check_queries
 from kernels.launch import channel_spans, launch, overload_vectors, vector_width
 from kernels.scatter import adjoint_of_gather
-from kernels.stencil import neighbour, offset
+from kernels.stencil import Grid, grid_of, neighbour, offset
 from kernels.vmap import fold_into_batch
 
 __all__ = ["gather_neighbours"]
@@ -22,7 +22,7 @@ def _gather_neighbours_kernel(
     features: wp.array4d[Any],
     queries: wp.array3d[wp.Float],
     span: int,
-    wrap: int,
+    grid: Grid,
     # out
     gathered_out: wp.array4d[Any],
     offsets_out: wp.array4d[wp.Float],
@@ -37,11 +37,11 @@ def _gather_neighbours_kernel(
     b = thread // spans // 4 // queries.shape[1]
     row = queries[b, q, 0]
     column = queries[b, q, 1]
-    i, j = neighbour(row, column, t, features.shape[1], features.shape[2], wrap)
+    i, j = neighbour(row, column, t, grid)
     for c in range(begin, end):
         gathered_out[b, q, t, c] = features[b, i, j, c]
     if begin == 0:
-        dr, dc = offset(row, column, t, features.shape[1], features.shape[2], wrap)
+        dr, dc = offset(row, column, t, grid)
         offsets_out[b, q, t, 0] = dr
         offsets_out[b, q, t, 1] = dc
 
@@ -51,13 +51,13 @@ _gather = overload_vectors(_gather_neighbours_kernel, half=True)
 
 @torch.library.custom_op("kernels::gather_neighbours", mutates_args=())
 def _gather_neighbours(features: torch.Tensor, queries: torch.Tensor, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    batch, _, _, channels = features.shape
+    batch, height, image_width, channels = features.shape
     count = queries.shape[1]
     gathered = features.new_empty(batch, count, 4, channels)
     offsets = queries.new_empty(batch, count, 4, 2)
     width = vector_width(channels)
     span, spans = channel_spans(channels // width, features.device)
-    inputs = [features, queries, span, int(wrap)]
+    inputs = [features, queries, span, grid_of(height, image_width, wrap)]
     launch(_gather[features.dtype, width], batch * count * 4 * spans, inputs, [gathered, offsets])
     return gathered, offsets
 
@@ -116,7 +116,8 @@ def gather_neighbours(
     check_floating("features", features, [dtype for dtype, _ in _gather], "(..., C, H, W)")
     if features.ndim < 3 or 0 in features.shape[-3:]:
         raise ValueError(f"features has shape {tuple(features.shape)}; it should be (..., C, H, W), none of them 0")
-    check_queries(queries, features, "features")
+    check_queries(queries)
+    check_devices(features=features, queries=queries)
     queries = queries.detach().to(torch.promote_types(features.dtype, torch.float32))
     batch, (features, queries) = broadcast_batch(features=(features, 3), queries=(queries, 2))
     if backend == "torch":

@@ -20,11 +20,19 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.checks import PRIORS, RANGE_FLOOR, broadcast_batch, check_backend, check_floating, check_queries
+from kernels.checks import (
+    PRIORS,
+    RANGE_FLOOR,
+    broadcast_batch,
+    check_backend,
+    check_devices,
+    check_floating,
+    check_queries,
+)
 from kernels.lanes import exp2
 from kernels.launch import BLOCKS, LEAST, launch, overload, query_blocks
 from kernels.scatter import PARTS, adjoint_of_gather, sum_slices
-from kernels.stencil import area, bounds, query_of
+from kernels.stencil import Grid, area, bounds, grid_of, query_of
 from kernels.vmap import fold_into_batch
 
 __all__ = ["gather_blend"]
@@ -41,9 +49,9 @@ def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
     m = 4 * n
 
     @wp.func
-    def ranges(image: wp.array3d[Any], b: int, at: Any, r: Any, wrap: int):
+    def ranges(image: wp.array3d[Any], b: int, at: Any, r: Any, grid: Grid):
         for k in range(n):
-            above, below, left, right = bounds(at[2 * k], at[2 * k + 1], image.shape[1], image.shape[2], wrap)
+            above, below, left, right = bounds(at[2 * k], at[2 * k + 1], grid)
             r[4 * k] = image[b, above, left]
             r[4 * k + 1] = image[b, above, right]
             r[4 * k + 2] = image[b, below, left]
@@ -59,7 +67,7 @@ def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
         scores: wp.array2d[four_stored],
         area_floor: wp.Float,
         prior: int,
-        wrap: int,
+        grid: Grid,
         # out
         blended_out: wp.array2d[one],
         weights_out: wp.array2d[four],
@@ -67,7 +75,7 @@ def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
         b, q = query_of(first + wp.tid(), queries.shape[1])
         at = queries[b, q]
         s = scores[b, q]
-        r = ranges(image, b, at, weights_out.dtype(), wrap)
+        r = ranges(image, b, at, weights_out.dtype(), grid)
         p = weights_out.dtype()  # exp of the prior: a factor, so that neither 0 nor its logarithm is special
         x = weights_out.dtype()
         for k in range(m):
@@ -110,22 +118,22 @@ def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
         adj_blended: wp.array2d[one],
         adj_weights: wp.array2d[four],
         prior: int,
-        wrap: int,
+        grid: Grid,
         slices: int,
-        share: int,
         # out
         adj_scores_out: wp.array2d[four_stored],
         adj_ranges_out: wp.array2d[four],
         adj_image_out: wp.array3d[wp.Float],
     ):
         b, s = query_of(first + wp.tid(), slices)
+        share = (weights.shape[1] + slices - 1) // slices
         if adj_image_out:
             for p in range(adj_image_out.shape[2]):
                 adj_image_out[b, s, p] = image.dtype(0.0)
         for q in range(s * share, wp.min((s + 1) * share, weights.shape[1])):
             at = queries[b, q]
             w = weights[b, q]
-            r = ranges(image, b, at, weights.dtype(), wrap)
+            r = ranges(image, b, at, weights.dtype(), grid)
             g = adj_blended[b, q]
             x = weights.dtype()
             for k in range(m):
@@ -151,11 +159,11 @@ def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
                 adj_ranges_out[b, q] = w
             if adj_image_out:
                 for k in range(n):
-                    above, below, left, right = bounds(at[2 * k], at[2 * k + 1], image.shape[1], image.shape[2], wrap)
-                    p0 = above * image.shape[2] + left
-                    p1 = above * image.shape[2] + right
-                    p2 = below * image.shape[2] + left
-                    p3 = below * image.shape[2] + right
+                    above, below, left, right = bounds(at[2 * k], at[2 * k + 1], grid)
+                    p0 = above * grid.width + left
+                    p1 = above * grid.width + right
+                    p2 = below * grid.width + left
+                    p3 = below * grid.width + right
                     adj_image_out[b, s, p0] = adj_image_out[b, s, p0] + w[4 * k]
                     adj_image_out[b, s, p1] = adj_image_out[b, s, p1] + w[4 * k + 1]
                     adj_image_out[b, s, p2] = adj_image_out[b, s, p2] + w[4 * k + 2]
@@ -174,9 +182,10 @@ def _gather_blend(
     image: torch.Tensor, queries: torch.Tensor, scores: torch.Tensor, prior: int, area_floor: float, wrap: bool
 ) -> tuple[torch.Tensor, torch.Tensor]:
     batch, count, _ = scores.shape
+    _, height, width = image.shape
     blended, weights = image.new_empty(batch, count), image.new_empty(batch, count, 4)
     for n, part in query_blocks(count, image.device):
-        inputs = [image, queries[:, part], scores[:, part], area_floor, prior, int(wrap)]
+        inputs = [image, queries[:, part], scores[:, part], area_floor, prior, grid_of(height, width, wrap)]
         outputs = [blended[:, part], weights[:, part]]
         launch(_blend[scores.dtype, n], outputs[0].numel() // n, inputs, outputs)
     return blended, weights
@@ -203,26 +212,27 @@ def _gather_blend_backward(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     batch, count, _ = weights.shape
     adj_scores = weights.new_empty(weights.shape, dtype=scores)
+    _, height, width = image.shape
+    grid = grid_of(height, width, wrap)
     blocks = query_blocks(count, weights.device)
     on_cpu = weights.device.type == "cpu"
     adj_ranges = None if on_cpu or not for_image else weights.new_empty(weights.shape)
-    # On a CPU few threads add up gradients of the image in slices of their own (`kernels.scatter.sum_by_query`).
-    slices = -(-PARTS // batch) if batch else 1
-    adj_image = weights.new_empty(batch, slices * len(blocks), image[0].numel()) if on_cpu and for_image else None
+    # On a CPU few threads sum gradients of the image, each in a slice of its own (`kernels.scatter.sum_by_query`).
+    slices = -(-PARTS // max(batch, 1))
+    adj_image = weights.new_empty(batch, slices * len(blocks), height * width) if on_cpu and for_image else None
     for i, (n, part) in enumerate(blocks):
         threads, least, own = (part.stop - part.start) // n, LEAST, None
-        share = 1
         if adj_image is not None:
-            share, threads, least = -(-threads // slices), slices, 1
+            threads, least = slices, 1
             own = adj_image[:, i * slices : (i + 1) * slices]
         adjoints = [adj_blended[:, part], None if adj_weights is None else adj_weights[:, part]]
-        inputs = [image, queries[:, part], weights[:, part], *adjoints, prior, int(wrap), threads, share]
+        inputs = [image, queries[:, part], weights[:, part], *adjoints, prior, grid, threads]
         outputs = [adj_scores[:, part], None if adj_ranges is None else adj_ranges[:, part], own]
         launch(_blend_backward[scores, n], batch * threads, inputs, outputs, least)
     if adj_image is not None:
         return adj_scores, sum_slices(adj_image.unsqueeze(-1)).view(image.shape)
     if adj_ranges is not None:
-        return adj_scores, adjoint_of_gather(adj_ranges.unsqueeze(-1), queries, *image.shape[1:], wrap).squeeze(-1)
+        return adj_scores, adjoint_of_gather(adj_ranges.unsqueeze(-1), queries, height, width, wrap).squeeze(-1)
     return adj_scores, image.new_empty(0)
 
 
@@ -343,14 +353,13 @@ def gather_blend(
     check_floating("scores", scores, [dtype for dtype, _ in _blend], "(..., Q, 4)")
     if image.ndim < 2 or 0 in image.shape[-2:]:
         raise ValueError(f"image has shape {tuple(image.shape)}; it should be (..., H, W), neither of them 0")
-    check_queries(queries, image, "image")
+    check_queries(queries)
+    check_devices(image=image, queries=queries, scores=scores)
     if image.dtype != torch.promote_types(scores.dtype, torch.float32):
         raise TypeError(
             f"scores is {scores.dtype}, image {image.dtype}; they should have one dtype, or scores half precision"
             " beside an image in float32"
         )
-    if scores.device != image.device:
-        raise ValueError(f"scores is on {scores.device}, image on {image.device}; they should be on one device")
     if scores.ndim < 2 or scores.shape[-2:] != (queries.shape[-2], 4):
         raise ValueError(f"scores has shape {tuple(scores.shape)}; it should be (..., {queries.shape[-2]}, 4)")
     queries = queries.detach().to(image.dtype)

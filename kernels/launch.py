@@ -1,4 +1,8 @@
-"""The one way a kernel is launched: torch tensors in, on their device, stream and CPU cores."""
+"""The one way a kernel is launched: torch tensors in, on their device, its current stream and all CPU cores.
+
+`overload` and `overload_vectors` make the concrete kernels of a generic one, `launch` runs a concrete kernel. The other
+functions say how the work of an op is shared out among threads.
+"""
 
 import collections
 import contextlib
@@ -7,11 +11,14 @@ import math
 import os
 import tempfile
 import threading
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import torch
 import warp as wp
+
+from kernels.checks import check_devices
 
 __all__ = [
     "BLOCKS",
@@ -26,12 +33,14 @@ __all__ = [
     "vector_width",
 ]
 
-# Below this many threads of work a second core costs more to wake than it saves.
+# Threads per core. With fewer, waking a second core costs more than it saves.
 LEAST = 512
-# More chunks than cores, so that a core which drew the cheap ones takes another.
+# There are more chunks than cores, so that a core whose chunks were cheap takes another.
 _CHUNKS_PER_CORE = 4
+# CPU threads have no blocks. Warp compiles a module once per block size, and this is what it launches with on a CPU.
+_CPU_BLOCK = 1
 
-# For each dtype of the tensors what Warp calls it, and the scalar that a kernel computes with.
+# For each dtype of the tensors its name in Warp, and the scalar that a kernel computes with.
 _DTYPES = {
     torch.float32: (wp.float32, wp.float32),
     torch.float64: (wp.float64, wp.float64),
@@ -44,14 +53,15 @@ _WIDTHS = (1, 16)
 
 _initialised = False
 _lock = threading.Lock()
+_loaded: set[tuple[wp.Kernel, torch.device]] = set()
 _pools: dict[int, ThreadPoolExecutor] = {}
 
-# Warp greets and reports each compilation on stdout, where the command line prints results.
+# By default Warp prints a greeting and every compilation to stdout, where the command line prints results.
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
 
 
 def _forget_pools() -> None:
-    # Threads do not survive a fork (DataLoader workers): the child makes its own, and a new lock as well.
+    # Threads do not survive a fork (DataLoader workers), so the child makes its own. The lock may have been held.
     global _lock
     _lock = threading.Lock()
     _pools.clear()
@@ -69,7 +79,7 @@ def _pool(cores: int) -> ThreadPoolExecutor:
 
 
 def initialise() -> None:
-    """Starts Warp, once; everything that calls Warp before a launch calls this first."""
+    """Starts Warp, once. `launch` does it as well; code that calls Warp before any launch calls this first."""
     global _initialised
     with _lock:
         if not _initialised:
@@ -80,7 +90,7 @@ def initialise() -> None:
 def _start_warp() -> None:
     with contextlib.ExitStack() as undo:
         if not torch.cuda.is_available():
-            # Without a driver Warp's native library warns on stderr at every start; who has no GPU knows.
+            # Without a driver Warp's native library warns on stderr at every start, which helps nobody without a GPU.
             with contextlib.suppress(OSError):
                 stderr = os.dup(2)
                 undo.callback(os.close, stderr)
@@ -90,7 +100,7 @@ def _start_warp() -> None:
         try:
             wp.init()
         except OSError:
-            # No home to keep compiled kernels in: they are compiled again in the next process.
+            # There is no writable home for compiled kernels, so the next process compiles them again.
             wp.config.kernel_cache_dir = tempfile.mkdtemp(prefix="warp-")
             wp.init()
 
@@ -171,58 +181,95 @@ def _dtypes(half: bool) -> dict[torch.dtype, tuple[type, type]]:
 
 
 def _to_warp(argument: Any, annotation: Any) -> Any:
+    if isinstance(argument, dict):
+        struct = annotation()
+        # Fields are set in the C struct: Warp's own setters want whole Warp arrays, which are slow to make.
+        for name, field in annotation.vars.items():
+            value = _to_warp(argument[name], field.type)
+            setattr(struct.__ctype__(), name, value.__ctype__() if isinstance(argument[name], dict) else value)
+        return struct
     if not isinstance(argument, torch.Tensor):
         return argument
     dtype = getattr(annotation, "dtype", None)
     if shape := getattr(dtype, "_shape_", ()):
         outer, inner = argument.shape[: annotation.ndim - 1], argument.shape[annotation.ndim - 1 :]
         argument = argument.view(*outer, math.prod(inner) // math.prod(shape), *shape)
-        if shape == (1,):  # a dimension of one element may have any stride; one that torch adds has the one Warp wants
+        if shape == (1,):  # a dimension of size 1 may have any stride; `unsqueeze` gives it the one that Warp wants
             argument = argument.squeeze(-1).unsqueeze(-1)
         return wp.from_torch(argument.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
     return wp.from_torch(argument.detach(), requires_grad=False, return_ctype=True)
 
 
-def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[Any], least: int = LEAST) -> None:
-    """Runs `threads` threads of a kernel on the device of its outputs and waits for nothing but CPU work.
+def _tensors(arguments: Iterable[tuple[str, Any]]) -> Iterator[tuple[str, torch.Tensor]]:
+    """The tensors among named arguments and among the fields of structs."""
+    for name, argument in arguments:
+        if isinstance(argument, torch.Tensor):
+            yield name, argument
+        elif isinstance(argument, dict):
+            yield from ((f"{name}.{field}", tensor) for field, tensor in _tensors(argument.items()))
 
-    A kernel's first argument is `first: int`, the number of its first thread: Warp runs a CPU launch on one core,
-    so that a CPU launch is split into ranges of threads that run side by side (Warp releases the GIL). The threads
-    of a kernel therefore must not write to shared elements, not even atomically: Warp's CPU atomics are plain adds.
-    The number of cores is torch's (`torch.set_num_threads`, `OMP_NUM_THREADS`), one inside a DataLoader worker.
+
+def _load(kernel: wp.Kernel, device: torch.device) -> None:
+    # Under the lock, since Warp must not compile or load one module in several threads at once.
+    initialise()
+    with _lock:
+        kernel.module.load(str(device), block_dim=_CPU_BLOCK if device.type == "cpu" else None)
+        _loaded.add((kernel, device))
+
+
+def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[Any], least: int = LEAST) -> None:
+    """Runs `threads` threads of a kernel on the device of its tensors.
+
+    On a CPU the call returns when the threads are done. On CUDA it queues them on torch's current stream and returns
+    at once.
+
+    Warp runs a CPU launch on one core but releases the GIL, so a CPU launch is split into ranges of threads that run
+    side by side. That has two consequences for a kernel. Its first argument is `first: int`, the number of the first
+    thread of a range. And its threads must not write to shared elements, not even atomically: Warp's CPU atomics are
+    plain additions. The number of cores is torch's (`torch.set_num_threads`, `OMP_NUM_THREADS`), and one inside a
+    DataLoader worker.
 
     Args:
         kernel: A Warp kernel without generic arguments (see `overload`).
         threads: How many threads to run.
-        inputs: The kernel's arguments after `first`: tensors, numbers, Warp handles, None for no array. The vectors of
-            an array of vectors lie one after the other in the last dimensions of the tensor.
-        outputs: Tensors the kernel writes, all on one device; the first is not None.
+        inputs: The kernel's arguments after `first`: tensors, None for no array, numbers, Warp handles, and for structs
+            dicts of their fields. The vectors of an array of vectors lie one after the other in the last dimensions of
+            the tensor.
+        outputs: The arguments that the kernel writes, of the same kinds.
         least: Fewest threads that are worth a core of their own.
+
+    Raises:
+        ValueError: If the tensors are not all on one device, or there are too many threads.
     """
     if threads == 0:
         return
     if threads >= 2**31:
-        raise ValueError(f"{threads} threads are more than a kernel can count; split the queries")
-    initialise()
-    annotations = [argument.type for argument in kernel.adj.args[1:]]
-    arguments = [_to_warp(a, t) for a, t in zip((*inputs, *outputs), annotations, strict=True)]
-    device = outputs[0].device
+        raise ValueError(f"threads is {threads}; it should be below 2^31: split the queries")
+    variables, values = kernel.adj.args[1:], (*inputs, *outputs)
+    tensors = dict(_tensors((v.label, value) for v, value in zip(variables, values, strict=True)))
+    check_devices(**tensors)
+    device = next(iter(tensors.values())).device
+    if (kernel, device) not in _loaded:
+        _load(kernel, device)
+    arguments = [_to_warp(value, v.type) for v, value in zip(variables, values, strict=True)]
     if device.type == "cuda":
-        # Given the stream, Warp neither switches its own, which all Python threads share, nor waits for it.
-        stream = wp.stream_from_torch(torch.cuda.current_stream(device))
-        wp.launch(kernel, threads, inputs=[0, *arguments], stream=stream, record_tape=False)
+        # Warp leaves the device of its last launch as the current one, and torch.cuda.device restores it. Given a
+        # stream, Warp neither switches its own, which all Python threads share, nor waits for it.
+        with torch.cuda.device(device):
+            stream = wp.stream_from_torch(torch.cuda.current_stream(device))
+            wp.launch(kernel, threads, inputs=[0, *arguments], stream=stream, record_tape=False)
         return
 
     def run(begin: int, end: int) -> None:
-        wp.launch(kernel, end - begin, inputs=[begin, *arguments], device="cpu", record_tape=False)
+        wp.launch(
+            kernel, end - begin, inputs=[begin, *arguments], device="cpu", record_tape=False, block_dim=_CPU_BLOCK
+        )
 
     cores = torch.get_num_threads()
     pieces = min(cores * _CHUNKS_PER_CORE, threads // least)
     if cores == 1 or pieces < 2:
         run(0, threads)
         return
-    with _lock:  # compiled or loaded once, before the cores ask for it together
-        kernel.module.load("cpu")
     edges = [threads * i // pieces for i in range(pieces + 1)]
     chunks = collections.deque(itertools.pairwise(edges))
 
@@ -234,7 +281,7 @@ def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[Any
                 return
             run(*chunk)
 
-    # This thread works as well; helpers that have not begun when it is done are not waited for.
+    # This thread works as well. Helpers that have not begun when it is done have nothing left to do.
     helpers = [_pool(cores).submit(work) for _ in range(cores - 1)]
     try:
         work()
@@ -244,20 +291,25 @@ def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[Any
                 helper.result()
 
 
-# Queries that a thread takes on a CPU, where the vectors of so many fill its registers, and on a GPU.
+# How many queries a thread takes: on a CPU 4, whose vectors fill its registers; on a GPU 1.
 BLOCKS = (4, 1)
 
 
 def query_blocks(count: int, device: torch.device) -> list[tuple[int, slice]]:
-    """Which queries go how many to a thread: on a CPU all but the odd ones at the end go in whole blocks."""
+    """Splits `count` queries into those that go to threads in blocks, and the rest.
+
+    Returns:
+        For each part that is not empty how many of its queries go to a thread, and the slice of its queries. On CUDA
+        each thread takes one.
+    """
     whole = 0 if device.type == "cuda" else count - count % BLOCKS[0]
     parts = zip(BLOCKS, [(0, whole), (whole, count)], strict=True)
     return [(n, slice(*ends)) for n, ends in parts if ends[0] < ends[1]]
 
 
 def channel_spans(blocks: int, device: torch.device) -> tuple[int, int]:
-    """How many blocks of channels a thread handles, and how many threads that takes.
+    """Returns how many blocks of channels a thread handles, and how many threads handle all of them.
 
-    A CPU core handles all; on a GPU each thread handles one, since neighbouring threads read together.
+    On a CPU one thread handles all blocks. On a GPU each thread handles one, since neighbouring threads read together.
     """
     return (1, blocks) if device.type == "cuda" else (blocks, 1)

@@ -23,9 +23,18 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.checks import PARTED, RANGE_FLOOR, SHARPEST, broadcast_batch, check_backend, check_floating, check_queries
+from kernels.checks import (
+    PARTED,
+    RANGE_FLOOR,
+    SHARPEST,
+    broadcast_batch,
+    check_backend,
+    check_devices,
+    check_floating,
+    check_queries,
+)
 from kernels.launch import launch, overload
-from kernels.stencil import bounds, query_of
+from kernels.stencil import Grid, bounds, grid_of, query_of
 from kernels.vmap import fold_into_batch
 
 __all__ = ["plane_prior"]
@@ -100,14 +109,14 @@ def _plane_prior_kernel(
     queries: wp.array3d[wp.Float],
     sharpness: wp.Float,
     area_floor: wp.Float,
-    wrap: int,
+    grid: Grid,
     # out
     prior_out: wp.array2d[_four],
 ):
     b, q = query_of(first + wp.tid(), queries.shape[1])
     row = queries[b, q, 0]
     column = queries[b, q, 1]
-    above, below, left, right = bounds(row, column, image.shape[1], image.shape[2], wrap)
+    above, below, left, right = bounds(row, column, grid)
     f = row - wp.floor(row)
     g = column - wp.floor(column)
     on_left, u = _between(image, b, above, below, f, sharpness, left)
@@ -134,7 +143,8 @@ def _plane_prior(
 ) -> torch.Tensor:
     batch, count, _ = queries.shape
     prior = image.new_empty(batch, count, 4)
-    inputs = [image, queries, min(sharpness, SHARPEST), area_floor, int(wrap)]
+    _, height, width = image.shape
+    inputs = [image, queries, min(sharpness, SHARPEST), area_floor, grid_of(height, width, wrap)]
     launch(_kernels[image.dtype], batch * count, inputs, [prior])
     return prior
 
@@ -185,7 +195,8 @@ def plane_prior(
         raise ValueError(f"area_floor is {area_floor}; it should be at least 0 and below 0.25")
     if not sharpness >= 1:
         raise ValueError(f"sharpness is {sharpness}; it should be at least 1")
-    check_queries(queries, image, "image")
+    check_queries(queries)
+    check_devices(image=image, queries=queries)
     queries = queries.detach().to(image.dtype)
     batch, (image, queries) = broadcast_batch(image=(image.detach(), 2), queries=(queries, 2))
     if backend == "torch":

@@ -1,84 +1,112 @@
 """The stencil: which 4 pixels surround a query, and where the query lies between them.
 
-A query is a continuous pixel coordinate (row, column) whose integers are pixel centres. Its neighbours are
-numbered (row-, col-), (row-, col+), (row+, col-), (row+, col+). Rows clamp at the image's first and last row. Columns
-wrap from W-1 to 0 on a full-circle image (`wrap`) and clamp otherwise. A query that lies on a pixel centre has that
-pixel as its neighbour 0. Clamped neighbours repeat a pixel: they are still four.
+A *query* is a continuous pixel coordinate (row, column); integers are pixel centres. These words mean the same
+everywhere in `kernels`:
+
+- *Neighbours*: the 4 pixels around a query, numbered t = 0..3 in the order (row-, col-), (row-, col+), (row+, col-),
+  (row+, col+). A query on a pixel centre has that pixel as its neighbour 0.
+- *Offset* Δq_t: query minus neighbour t, in rows and columns of pixels.
+- *Area* S_t / S: the bilinear weight of neighbour t (paper, Eq. 2), see `area`.
+- *Seam*: where column W-1 meets column 0. Columns wrap around it if the grid says so, and clamp otherwise. Rows always
+  clamp. A clamped neighbour repeats a pixel: there are still four.
+
+`kernels.scatter` is the adjoint of the stencil.
 """
 
 from typing import Any
 
 import warp as wp
 
-__all__ = ["area", "base", "bounds", "column_of", "neighbour", "offset", "query_of"]
+__all__ = ["Grid", "area", "base", "bounds", "column_of", "grid_of", "neighbour", "offset", "query_of"]
+
+
+@wp.struct
+class Grid:
+    """The pixels of an image, as a kernel's argument."""
+
+    height: int
+    """Rows H."""
+    width: int
+    """Columns W."""
+    wrap: int
+    """1 if column W-1 meets column 0, a full circle; 0 if columns clamp."""
+
+
+def grid_of(height: int, width: int, wrap: bool) -> dict[str, int]:
+    """Returns the fields of a `Grid` for `kernels.launch.launch`: H, W, and whether columns wrap around the seam."""
+    return {"height": height, "width": width, "wrap": int(wrap)}
 
 
 @wp.func
 def query_of(thread: int, count: int):
-    """Which image and which of its `count` queries a thread serves; the CPU compiler sees that neither is negative."""
-    b = wp.max(thread // count, 0)
+    """Image and query number of a thread, where each image has `count` queries."""
+    b = wp.max(thread // count, 0)  # neither is negative, and `max` lets the CPU compiler see it
     return b, wp.max(thread - b * count, 0)
 
 
 @wp.func
 def base(coordinate: Any):
-    """The integer below a coordinate; absurd ones stay within what an int holds."""
+    """The integer at or below a coordinate, kept within ±2^30 so that an int holds it; -2^30 for NaN."""
     limit = type(coordinate)(1073741824.0)  # 2^30
-    return int(wp.floor(wp.clamp(coordinate, -limit, limit)))
+    coordinate = wp.where(coordinate > -limit, coordinate, -limit)  # not `clamp`, which leaves NaN to the device
+    return int(wp.floor(wp.where(coordinate < limit, coordinate, limit)))
 
 
 @wp.func
-def column_of(column: int, width: int, wrap: int):
+def column_of(column: int, grid: Grid):
     """The pixel column that an unbounded column number stands for."""
-    if wrap != 0:
-        if column >= 0 and column < width:
+    if grid.wrap != 0:
+        if column >= 0 and column < grid.width:
             return column  # the usual case, without a division
-        return ((column % width) + width) % width
-    return wp.clamp(column, 0, width - 1)
+        return ((column % grid.width) + grid.width) % grid.width
+    return wp.clamp(column, 0, grid.width - 1)
 
 
 @wp.func
-def bounds(row: Any, column: Any, height: int, width: int, wrap: int):
-    """Rows above and below and columns left and right of a query, which its neighbours are made of."""
+def bounds(row: Any, column: Any, grid: Grid):
+    """Rows above and below and columns left and right of a query: its neighbours are their four combinations."""
     r = wp.floor(row)
     c = wp.floor(column)
     zero = type(row)(0.0)
-    if r >= zero and c >= zero and r < type(row)(height - 1) and c < type(row)(width - 1):
-        above = wp.max(int(r), 0)  # it is: so much the compiler must see, or it provides for negative indices
+    if r >= zero and c >= zero and r < type(row)(grid.height - 1) and c < type(row)(grid.width - 1):
+        above = wp.max(int(r), 0)  # never negative, and `max` lets the compiler see it
         left = wp.max(int(c), 0)
         return above, above + 1, left, left + 1  # the usual case, without a border
     i = base(row)
     j = base(column)
     return (
-        wp.max(wp.min(i, height - 1), 0),
-        wp.max(wp.min(i + 1, height - 1), 0),
-        wp.max(column_of(j, width, wrap), 0),
-        wp.max(column_of(j + 1, width, wrap), 0),
+        wp.max(wp.min(i, grid.height - 1), 0),
+        wp.max(wp.min(i + 1, grid.height - 1), 0),
+        wp.max(column_of(j, grid), 0),
+        wp.max(column_of(j + 1, grid), 0),
     )
 
 
 @wp.func
-def neighbour(row: Any, column: Any, t: int, height: int, width: int, wrap: int):
-    """Pixel (row, column) of the query's neighbour number t."""
+def neighbour(row: Any, column: Any, t: int, grid: Grid):
+    """Pixel (row, column) of neighbour t of a query."""
     return (
-        wp.clamp(base(row) + t // 2, 0, height - 1),
-        column_of(base(column) + t % 2, width, wrap),
+        wp.clamp(base(row) + t // 2, 0, grid.height - 1),
+        column_of(base(column) + t % 2, grid),
     )
 
 
 @wp.func
-def offset(row: Any, column: Any, t: int, height: int, width: int, wrap: int):
-    """Query minus neighbour number t in pixels (rows, columns); never a jump over the seam."""
-    r = wp.clamp(base(row) + t // 2, 0, height - 1)
+def offset(row: Any, column: Any, t: int, grid: Grid):
+    """Query minus neighbour t in rows and columns; small at the seam as well, where pixel columns jump."""
+    r = wp.clamp(base(row) + t // 2, 0, grid.height - 1)
     c = base(column) + t % 2
-    if wrap == 0:
-        c = wp.clamp(c, 0, width - 1)
+    if grid.wrap == 0:
+        c = wp.clamp(c, 0, grid.width - 1)
     return row - type(row)(r), column - type(column)(c)
 
 
 @wp.func
 def area(row: Any, column: Any, t: int):
-    """Bilinear weight of neighbour t: the area between the query and the diagonally opposite neighbour (S_t / S)."""
+    """S_t / S (paper, Eq. 2), the area of the rectangle between the query and the neighbour diagonally opposite to t.
+
+    The unit cell between the 4 neighbours has the area S = 1. The nearer the query is to neighbour t, the larger S_t.
+    """
     fr = row - wp.floor(row)
     fc = column - wp.floor(column)
     one = type(row)(1.0)

@@ -17,7 +17,7 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.checks import PRIORS, RANGE_FLOOR, check_backend, check_queries
+from kernels.checks import PRIORS, RANGE_FLOOR, check_backend, check_devices, check_queries
 from kernels.lanes import LANES, add_products, gelu, rsqrt, total, vectors
 from kernels.launch import launch
 from kernels.neighbour_attention.maths import attend, stencil
@@ -273,7 +273,9 @@ def fused_decode(
     check_backend(backend)
     if prior not in PRIORS:
         raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}")
-    check_queries(queries, projected.pixels, "projected")
+    check_queries(queries)
+    check_devices(projected=projected.pixels, image=image, queries=queries, output=weights.output[0])
+    check_devices(projected=projected.pixels, **({} if added is None else {"added": added}))
     batch, height, width, _ = projected.pixels.shape
     if image.shape != (batch, height, width):
         raise ValueError(f"image has shape {tuple(image.shape)}; it should be {(batch, height, width)}")

@@ -25,7 +25,7 @@ from typing import Any
 import warp as wp
 
 from kernels.lanes import exp2, fold, total, zeros4, zeros16
-from kernels.stencil import neighbour, offset
+from kernels.stencil import Grid, neighbour, offset
 
 __all__ = ["MOMENTS", "adj_squares", "affine", "attend", "attend_backward", "stencil"]
 
@@ -51,11 +51,15 @@ def stencil(
     down = wp.vector(dtype=type(eps), length=4)
     right = wp.vector(dtype=type(eps), length=4)
     inverse = wp.vector(dtype=type(eps), length=4)
+    grid = Grid()
+    grid.height = height
+    grid.width = width
+    grid.wrap = wrap
     row = queries[n, 0]
     column = queries[n, 1]
     for t in range(4):
-        i, j = neighbour(row, column, t, height, width, wrap)
-        dr, dc = offset(row, column, t, height, width, wrap)
+        i, j = neighbour(row, column, t, grid)
+        dr, dc = offset(row, column, t, grid)
         p = (image * height + i) * width + j
         cross = dr * moments[p, 1] + dc * moments[p, 2]
         squares = moments[p, 0] + cross + cross

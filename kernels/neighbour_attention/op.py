@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from kernels import reference
-from kernels.checks import check_backend, check_floating, check_queries
+from kernels.checks import check_backend, check_devices, check_floating, check_queries
 from kernels.launch import launch
 from kernels.neighbour_attention import vectors
 from kernels.neighbour_attention.heads import _attend, _attend_backward
@@ -178,7 +178,9 @@ def neighbour_attention(
     check_backend(backend)
     pixels, slope, shift, gram, heads = projected
     check_floating("projected.pixels", pixels, [torch.float32, torch.float64], "(B, H, W, 4·C + 16)")
-    check_queries(queries, pixels, "projected")
+    check_queries(queries)
+    tensors = {"projected": pixels, "slope": slope, "shift": shift, "gram": gram, "queries": queries}
+    check_devices(**tensors, output=output[0], bias=output[1])
     if queries.ndim != 3 or len(queries) != len(pixels):
         raise ValueError(f"queries has shape {tuple(queries.shape)}; it should be ({len(pixels)}, Q, 2)")
     channels = len(shift) // 3

@@ -1,6 +1,12 @@
-"""A mesh and its rays: nearest hits through Warp's bounding volume hierarchy, one thread a ray."""
+"""A mesh and its rays: nearest hits through Warp's bounding volume hierarchy, with one thread per ray.
 
-from functools import cached_property
+`Mesh.cast` walks the hierarchy for any rays. `Mesh.project` finds the rays of a whole range image, which all start at
+one point, with `kernels.rays.projection`.
+"""
+
+import math
+import threading
+from numbers import Real
 from typing import NamedTuple
 
 import numpy as np
@@ -16,21 +22,23 @@ __all__ = ["Hits", "Mesh"]
 
 # Metres. A nearer hit is reported at this range, since 0 means none.
 _LEAST_RANGE = 1e-6
-# Triangles of a mesh that many rays will be cast at.
+# Triangles. A larger mesh is expected to meet enough rays to be worth a better and slower tree.
 _LARGE = 200_000
-# Rays that are cast one by one in the time that a projection takes to begin.
+# How many rays `cast` can do in the time that `project` takes before its first.
 _FEW_RAYS = 3000
+# How far R Rᵀ may be from the identity: 1 cm at 100 m.
+_ROTATION = 1e-4
 
 
 class Hits(NamedTuple):
-    """What rays met; all tensors have the rays' batch shape."""
+    """What rays met. All tensors have the rays' batch shape."""
 
     range: torch.Tensor
-    """float32 [m], distance along the unit direction; 0 = nothing within the maximum range."""
+    """float32 [m], distance along the unit direction; 0 where nothing was hit within the maximum range."""
     triangle: torch.Tensor
-    """int32, number of the triangle that was hit; -1 = none."""
+    """int32, number of the triangle that was hit; -1 where none was."""
     cosine: torch.Tensor
-    """float32 in [0, 1], of the angle between ray and surface normal, whichever way it points; 0 = none."""
+    """float32 in [0, 1], of the angle between ray and surface normal, on either side; 0 where nothing was hit."""
 
 
 @wp.kernel(enable_backward=False)
@@ -63,14 +71,14 @@ def _cast_rays_kernel(
 class Mesh:
     """Triangles that rays can be cast at, kept on one device with a hierarchy of boxes around them.
 
-    Both sides of a triangle are hit; triangles without an area never are. The mesh need not be watertight nor wound
-    consistently.
+    Rays hit both sides of a triangle, and never a triangle without an area. The mesh need be neither watertight nor
+    wound consistently. Several threads may use one mesh.
 
     Args:
-        vertices: (V, 3) floating-point, metres, in any frame. They are copied; float64 keeps its precision far from the
-            frame's origin (georeferenced meshes).
+        vertices: (V, 3) floating-point, metres, in any frame. They are copied. Vertices far from the frame's origin
+            (georeferenced meshes) keep their precision if they are float64.
         triangles: (F, 3) integer, numbers of the vertices.
-        device: Where the mesh is kept and the rays are cast; a torch device or its name.
+        device: Torch device, or its name, on which the mesh is kept and the rays are cast.
 
     Raises:
         TypeError: If an argument is not an array of numbers of the right kind.
@@ -96,7 +104,8 @@ class Mesh:
         points, faces = points.detach(), faces.detach().to(torch.int64)
         if not (finite := points.isfinite().all(1)).all():
             raise ValueError(
-                f"vertices holds {int((~finite).sum())} NaN or infinite of {len(points)}; remove them first"
+                f"vertices holds {int((~finite).sum())} NaN or infinite of {len(points)}; it should be finite: remove"
+                " them first"
             )
         if faces.min() < 0 or faces.max() >= len(points):
             raise ValueError(
@@ -105,45 +114,58 @@ class Mesh:
         try:
             self.device = torch.empty(0, device=device).device
         except (RuntimeError, AssertionError) as error:
-            raise ValueError(f"device is {device!r}, which is not there: {str(error).splitlines()[0]}") from None
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"device is {device!r}; it should be a device of this machine: {reason}") from None
         initialise()
-        # Rays are cast in float32, whose millimetres end 10 km from the origin: so the origin is the mesh's middle.
+        # Rays are cast in float32, which resolves millimetres only up to 10 km from the origin. So the middle of the mesh
+        # becomes the origin.
         self._middle = ((points.amin(0) + points.amax(0)).double() / 2).round().to(self.device)
         self._vertices = (points.to(self.device).double() - self._middle).float()
         self._triangles = faces.to(self.device, torch.int32).contiguous()
 
+        # Made when first asked for, since few meshes need both, and under a lock: if two threads made a tree each, one
+        # tree would be dropped while rays are on their way through it.
+        self._lock = threading.Lock()
+        self._tree: wp.Mesh | None = None
+        self._clusters: Clusters | None = None
+
     def __del__(self) -> None:
         # Warp frees a tree at once, though rays may still be on their way through it.
-        if "_tree" in self.__dict__ and self.device.type == "cuda":
+        if getattr(self, "_tree", None) is not None and self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
 
-    # Made when they are first asked for: few meshes need both.
+    def _get_tree(self) -> wp.Mesh:
+        with self._lock:
+            if self._tree is None:
+                self._tree = self._build_tree()
+            return self._tree
 
-    @cached_property
-    def _tree(self) -> wp.Mesh:
-        if self.device.type == "cuda":
+    def _build_tree(self) -> wp.Mesh:
+        # By default Warp builds a tree fast on CUDA, but rays take longer through it. That suits the mesh of one scan.
+        constructor = "sah" if len(self._triangles) > _LARGE else None
+        points = wp.from_torch(self._vertices, dtype=wp.vec3)
+        indices = wp.from_torch(self._triangles.view(-1), dtype=wp.int32)
+        if self.device.type != "cuda":
+            return wp.Mesh(points, indices, bvh_constructor=constructor)
+        with torch.cuda.device(self.device):  # Warp leaves another device as the current one
             torch.cuda.synchronize(self.device)  # the copies ran on torch's stream, and the tree is built on Warp's
-        tree = wp.Mesh(
-            points=wp.from_torch(self._vertices, dtype=wp.vec3),
-            indices=wp.from_torch(self._triangles.view(-1), dtype=wp.int32),
-            # On CUDA Warp would build a tree in no time that rays take longer through: right for a mesh of one scan.
-            bvh_constructor="sah" if len(self._triangles) > _LARGE else None,
-        )
-        if self.device.type == "cuda":
-            wp.synchronize_device(str(self.device))  # and used on torch's again
+            tree = wp.Mesh(points, indices, bvh_constructor=constructor)
+            wp.synchronize_device(str(self.device))  # the rays run on torch's stream again
         return tree
 
-    @cached_property
-    def _clusters(self) -> Clusters:
-        return cluster_triangles(self._vertices, self._triangles)
+    def _get_clusters(self) -> Clusters:
+        with self._lock:
+            if self._clusters is None:
+                self._clusters = cluster_triangles(self._vertices, self._triangles)
+            return self._clusters
 
     def cast(self, origins: torch.Tensor, directions: torch.Tensor, max_range: float, backend: str = "warp") -> Hits:
         """Finds the nearest hit of each ray.
 
         Args:
             origins: (..., 3) floating-point, metres, in the frame of the vertices, on the mesh's device.
-            directions: (..., 3) of any length but 0; leading dimensions broadcast against those of `origins`.
-            max_range: Metres; farther surfaces are not seen.
+            directions: (..., 3) of any length but 0. Leading dimensions broadcast against those of `origins`.
+            max_range: Metres. Surfaces farther away are not seen.
             backend: "warp", or "torch" for the plain twin in `kernels.reference`, which tries every triangle.
 
         Returns:
@@ -160,31 +182,28 @@ class Mesh:
             if tensor.ndim == 0 or tensor.shape[-1] != 3:
                 raise ValueError(f"{name} has shape {tuple(tensor.shape)}; it should be (..., 3)")
             if tensor.device != self.device:
-                raise ValueError(
-                    f"{name} is on {tensor.device}, the mesh on {self.device}; they should be on one device"
-                )
+                raise ValueError(f"{name} is on {tensor.device}; it should be on {self.device}, where the mesh is")
             if not tensor.isfinite().all():
-                raise ValueError(f"{name} holds NaN or infinite values")
+                raise ValueError(f"{name} holds NaN or infinite values; it should be finite")
         if not (directions != 0).any(-1).all():
-            raise ValueError("directions holds a direction of length 0; each should point somewhere")
-        if not isinstance(max_range, int | float) or not max_range > 0:
-            raise ValueError(f"max_range is {max_range}; it should be a number of metres above 0")
+            raise ValueError("directions holds a direction of length 0; every direction should have a length above 0")
+        _check_range(max_range)
         batch, (origins, directions) = broadcast_batch(
             origins=(origins.detach(), 1), directions=(directions.detach(), 1)
         )
         origins = (origins.double() - self._middle).float()
-        # Lengths are evened out before float32, which cannot hold the square of a very long or very short one.
+        # Scaled before they become float32, which cannot hold the square of a very large or small length.
         directions = (directions / directions.abs().amax(-1, keepdim=True)).float()
         directions = torch.nn.functional.normalize(directions, dim=-1).contiguous()
         if backend == "torch":
             ranges, triangles, cosines = reference.cast_rays(
-                self._vertices, self._triangles, origins, directions, max_range
+                self._vertices, self._triangles, origins, directions, float(max_range)
             )
         else:
             ranges = origins.new_empty(len(origins))
             triangles = torch.empty_like(ranges, dtype=torch.int32)
             cosines = torch.empty_like(ranges)
-            inputs = [self._tree.id, origins, directions, float(max_range)]
+            inputs = [self._get_tree().id, origins, directions, float(max_range)]
             launch(_cast_rays_kernel, len(origins), inputs, [ranges, triangles, cosines])
         return Hits(ranges.view(batch), triangles.view(batch), cosines.view(batch))
 
@@ -193,43 +212,68 @@ class Mesh:
     ) -> torch.Tensor:
         """Finds the range along each ray of a range image, whose rays all start at one point, without walking a tree.
 
-        The same ranges as `cast` gives, but for rays that graze an edge. The time grows with the triangles within
-        reach, and hardly with the number of rays; see `projects_faster`.
+        Gives the same ranges as `cast`, except for rays that graze an edge. The time grows with the number of triangles
+        within reach, and hardly with that of rays; see `projects_faster`.
 
         Args:
-            pose: (4, 4) transform from the sensor frame to that of the vertices, a rotation and a translation [m].
+            pose: (4, 4) transform from the sensor frame to that of the vertices, a rotation and a translation [m]; on
+                any device, as are the tables.
             elevations: (H,) rad, of the rows, within ±90 degrees.
             azimuths: (W,) rad, of the columns, all different, within one turn.
-            max_range: Metres; farther surfaces are not seen.
+            max_range: Metres. Surfaces farther away are not seen.
 
         Returns:
-            (H, W) float32 metres; 0 where nothing is met.
+            (H, W) float32 metres, 0 where nothing is met, on the mesh's device.
 
         Raises:
-            ValueError: If a shape does not fit, a table is empty or not finite, or `max_range` is not positive.
+            ValueError: If a shape does not fit, `pose` is not a rotation and a translation, a table is empty, not
+                finite or out of bounds, or `max_range` is not a positive number.
         """
         if pose.shape != (4, 4) or not pose.isfinite().all():
             raise ValueError(f"pose has shape {tuple(pose.shape)}; it should be (4, 4), of finite numbers")
         for name, table in (("elevations", elevations), ("azimuths", azimuths)):
             if table.ndim != 1 or len(table) == 0 or not table.isfinite().all():
-                raise ValueError(f"{name} has shape {tuple(table.shape)}; it should be a list of finite numbers")
-        if not max_range > 0:
-            raise ValueError(f"max_range is {max_range}; it should be a number of metres above 0")
-        pose = pose.to(self.device).double()
+                raise ValueError(f"{name} has shape {tuple(table.shape)}; it should be (N,), of N > 0 finite numbers")
+        _check_range(max_range)
+        pose = pose.double()
+        rotation, last = pose[:3, :3], pose.new_tensor([0.0, 0.0, 0.0, 1.0])
+        skew = max(
+            float((rotation @ rotation.T - rotation.new_ones(3).diag()).abs().max()),
+            float((pose[3] - last).abs().max()),
+        )
+        if skew > _ROTATION or rotation.det() < 0:
+            raise ValueError(
+                f"pose is {pose.tolist()}; it should be a rotation and a translation, with last row 0 0 0 1"
+            )
+        if elevations.abs().max() > math.pi / 2:
+            raise ValueError(f"elevations reaches {float(elevations.abs().max())} rad; it should lie within ±π/2")
+        if len(azimuths.unique()) < len(azimuths) or azimuths.max() - azimuths.min() > math.tau * (1 + 1e-6):
+            low, high = float(azimuths.min()), float(azimuths.max())
+            raise ValueError(
+                f"azimuths has {len(azimuths.unique())} values of {len(azimuths)} from {low} to {high} rad; it should"
+                " have different ones within one turn"
+            )
+        pose = pose.to(self.device)
         origin, rotation = pose[:3, 3] - self._middle, pose[:3, :3]
-        return project_triangles(self._clusters, origin, rotation, elevations, azimuths, float(max_range))
+        return project_triangles(self._get_clusters(), origin, rotation, elevations, azimuths, float(max_range))
 
     def projects_faster(self, position: torch.Tensor, rays: int, max_range: float) -> bool:
-        """Tells whether `project` finds the ranges of so many rays from a position sooner than `cast`.
+        """Tells whether `project` finds the ranges of many rays from one position sooner than `cast`.
 
         Args:
             position: (3,) metres, in the frame of the vertices.
-            rays: Their number.
+            rays: How many rays there are.
             max_range: Metres, of the rays.
 
         Returns:
-            False on CUDA. On a CPU a ray of `cast` takes as long as about four triangles within reach of `project`.
+            Always False on CUDA. On a CPU, `cast` does a ray in the time in which `project` does about four triangles
+            within reach.
         """
         if self.device.type != "cpu":
             return False
-        return rays > _FEW_RAYS + within_reach(self._clusters, position - self._middle, max_range) / 4
+        return rays > _FEW_RAYS + within_reach(self._get_clusters(), position - self._middle, max_range) / 4
+
+
+def _check_range(max_range: float) -> None:
+    if not isinstance(max_range, Real) or not max_range > 0:
+        raise ValueError(f"max_range is {max_range}; it should be a number of metres above 0")

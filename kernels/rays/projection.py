@@ -1,14 +1,14 @@
 """Rays from one point: triangles are projected onto the range image, instead of walking a tree for every ray.
 
-The rays of a column lie in a half-plane that ends in the vertical axis of the sensor. It cuts a triangle in a segment
-(ρ₁, z₁)-(ρ₂, z₂), whose ends bound the rows that see it, and a ray of slope m = tan(elevation) meets the line through
-them at
+The rays of a column lie in a half-plane that ends in the vertical axis of the sensor. The half-plane cuts a triangle in
+a segment (ρ₁, z₁)-(ρ₂, z₂) of horizontal distances ρ and heights z. The ends of the segment bound the rows that see it.
+A ray of slope m = tan(elevation) meets the line through the ends exactly at
 
     ρ = (ρ₁ Δz - z₁ Δρ) / (Δz - m Δρ),    range = ρ √(1 + m²)
 
-exactly, without a tree over the triangles. What cannot be seen is left out before that, coarse to fine: clusters of
-neighbouring triangles out of reach or above and below all rows, then triangles between two rows or two columns. Columns
-are shared out in blocks, so that no two threads write to one.
+What cannot be seen is left out before that, from coarse to fine: first clusters of neighbouring triangles that are out
+of reach, or above or below all rows; then triangles that lie between two rows or two columns. Each thread takes a block
+of columns, so that no two threads write to one pixel.
 """
 
 from typing import NamedTuple
@@ -20,24 +20,24 @@ from kernels.launch import launch
 
 __all__ = ["Clusters", "cluster_triangles", "project_triangles", "within_reach"]
 
-# Triangles of a cluster.
+# How many triangles make a cluster.
 _SIZE = wp.constant(64)
-# Blocks of columns for each core. Each block looks at the columns of every triangle.
+# How many blocks of columns a core gets. Each block looks at the columns of every triangle.
 _BLOCKS_PER_CORE = 8
-# Radians that a triangle's columns are widened by: the cut decides, but float32 decides what is cut. The same, as a
-# share of their slope, for its rows.
-_MARGIN = 1e-5
-# Metres from the vertical axis that a segment is cut off at, where it crosses the axis; and the least range.
-_NEAR = 1e-6
+# By how much the columns [rad] and the slopes (as a share) of a triangle are widened, since float32 rounds them. The
+# exact cut decides afterwards.
+_MARGIN = wp.constant(1e-5)
+# Metres. A segment that crosses the vertical axis is cut off at this distance from it. Also the least range.
+_NEAR = wp.constant(1e-6)
 
 _TURN = wp.constant(6.283185307179586)
 
 
 class Clusters(NamedTuple):
-    """Triangles in an order that keeps neighbours together, 64 to a cluster, and a ball around each cluster."""
+    """Triangles in groups of 64 neighbouring ones, with a ball around each group."""
 
     corners: torch.Tensor
-    """(64 C, 3, 3) float32, metres; the last cluster is filled up with triangles of no size."""
+    """(64 C, 3, 3) float32, metres. Triangles of no size fill the last cluster."""
     centres: torch.Tensor
     """(C, 3) float32, metres."""
     radii: torch.Tensor
@@ -45,14 +45,11 @@ class Clusters(NamedTuple):
 
 
 def cluster_triangles(vertices: torch.Tensor, triangles: torch.Tensor) -> Clusters:
-    """Sorts triangles along a space-filling curve and groups them.
+    """Sorts triangles along a space-filling curve (Morton order) and groups them.
 
     Args:
         vertices: (V, 3) float32, metres.
         triangles: (F, 3) int32, numbers of the vertices.
-
-    Returns:
-        The clusters.
     """
     corners = vertices[triangles.long()]
     middle = corners.mean(1)
@@ -69,7 +66,7 @@ def cluster_triangles(vertices: torch.Tensor, triangles: torch.Tensor) -> Cluste
 
 @wp.func
 def _lower_bound(table: wp.array[float], value: float):
-    """How many entries of a rising table are below a value."""
+    """Number of entries of a rising table that are below a value."""
     begin = wp.int32(0)
     end = table.shape[0]
     while begin < end:
@@ -83,19 +80,19 @@ def _lower_bound(table: wp.array[float], value: float):
 
 @wp.func
 def _horizontal(a: wp.vec3):
-    """The distance of a point from the vertical axis."""
+    """Distance of a point from the vertical axis."""
     return wp.sqrt(a[0] * a[0] + a[1] * a[1])
 
 
 @wp.func
-def _between_rows(a: wp.vec3, b: wp.vec3, c: wp.vec3, edge: float, slopes: wp.array[float], margin: float):
-    """Whether no row can see a triangle, judged by bounds on its slopes."""
+def _between_rows(a: wp.vec3, b: wp.vec3, c: wp.vec3, edge: float, slopes: wp.array[float]):
+    """Whether bounds on the slopes of a triangle show that no row sees it. `edge` is the longest one."""
     ra = _horizontal(a)
     rb = _horizontal(b)
     rc = _horizontal(c)
     nearest = wp.min(ra, wp.min(rb, rc))
     farthest = wp.max(ra, wp.max(rb, rc))
-    # No chord of length `edge` between points at least so far from the axis comes nearer.
+    # A chord of length `edge` between points at least `nearest` from the axis comes no nearer to it than `inner`.
     inner = nearest * nearest - 0.25 * edge * edge
     if inner <= 1.0e-3 * edge * edge:
         return False
@@ -104,10 +101,10 @@ def _between_rows(a: wp.vec3, b: wp.vec3, c: wp.vec3, edge: float, slopes: wp.ar
     high = wp.max(a[2], wp.max(b[2], c[2]))
     low = wp.where(low < 0.0, low / inner, low / farthest)
     high = wp.where(high > 0.0, high / inner, high / farthest)
-    row = _lower_bound(slopes, low - margin * (1.0 + wp.abs(low)))
+    row = _lower_bound(slopes, low - _MARGIN * (1.0 + wp.abs(low)))
     if row == slopes.shape[0]:
         return True
-    return slopes[row] > high + margin * (1.0 + wp.abs(high))
+    return slopes[row] > high + _MARGIN * (1.0 + wp.abs(high))
 
 
 @wp.kernel(enable_backward=False)
@@ -121,7 +118,6 @@ def _find_columns_kernel(
     azimuths: wp.array[float],
     slopes: wp.array[float],
     max_range: float,
-    margin: float,
     # out
     corners_out: wp.array2d[wp.vec3],
     columns_out: wp.array[wp.vec2i],
@@ -134,7 +130,7 @@ def _find_columns_kernel(
     edge = wp.max(wp.length(b - a), wp.max(wp.length(c - b), wp.length(a - c)))
     nearest = wp.min(wp.length(a), wp.min(wp.length(b), wp.length(c)))
     columns = wp.vec2i(0, 0)
-    if nearest - edge <= max_range and not _between_rows(a, b, c, edge, slopes, margin):
+    if nearest - edge <= max_range and not _between_rows(a, b, c, edge, slopes):
         ab = a[0] * b[1] - a[1] * b[0]
         bc = b[0] * c[1] - b[1] * c[0]
         ca = c[0] * a[1] - c[1] * a[0]
@@ -155,8 +151,8 @@ def _find_columns_kernel(
                     w = w + _TURN
                 low = wp.min(u, wp.min(v, w))
                 high = wp.max(u, wp.max(v, w))
-            low = low - margin
-            high = high + margin
+            low = low - _MARGIN
+            high = high + _MARGIN
             turns = wp.floor((low - azimuths[0]) / _TURN) * _TURN
             low = low - turns
             high = high - turns
@@ -177,16 +173,15 @@ def _cut(
     cosine: float,
     slopes: wp.array[float],
     max_range: float,
-    near: float,
     column: int,
     # out
     ranges_out: wp.array2d[float],
 ):
-    """Cuts a triangle by the half-plane of a column, and keeps what is nearer than what its rows saw so far."""
+    """Cuts a triangle by the half-plane of a column, and keeps each range that is less than what its row has so far."""
     sa = cosine * a[1] - sine * a[0]
     sb = cosine * b[1] - sine * b[0]
     sc = cosine * c[1] - sine * c[0]
-    # The corner alone on its side of the plane: its two edges are cut.
+    # p is the corner alone on its side of the plane, whose two edges are cut.
     left_a = sa <= 0.0
     left_b = sb <= 0.0
     left_c = sc <= 0.0
@@ -218,17 +213,17 @@ def _cut(
     rho2 = cosine * e[0] + sine * e[1]
     z1 = d[2]
     z2 = e[2]
-    if rho1 < near and rho2 < near:
+    if rho1 < _NEAR and rho2 < _NEAR:
         return
     drho = rho2 - rho1
     dz = z2 - z1
     numerator = rho1 * dz - z1 * drho
-    if rho1 < near:
-        z1 = z1 + dz * (near - rho1) / drho
-        rho1 = near
-    if rho2 < near:
-        z2 = z2 + dz * (near - rho2) / drho
-        rho2 = near
+    if rho1 < _NEAR:
+        z1 = z1 + dz * (_NEAR - rho1) / drho
+        rho1 = _NEAR
+    if rho2 < _NEAR:
+        z2 = z2 + dz * (_NEAR - rho2) / drho
+        rho2 = _NEAR
     m1 = z1 / rho1
     m2 = z2 / rho2
     high = wp.max(m1, m2)
@@ -238,7 +233,7 @@ def _cut(
         if m > high:
             return
         distance = numerator / (dz - m * drho) * wp.sqrt(1.0 + m * m)
-        if distance > near and distance <= max_range and distance < ranges_out[column, row]:
+        if distance > _NEAR and distance <= max_range and distance < ranges_out[column, row]:
             ranges_out[column, row] = distance
         row += 1
 
@@ -253,7 +248,6 @@ def _project_kernel(
     cosines: wp.array[float],
     slopes: wp.array[float],
     max_range: float,
-    near: float,
     span: int,
     # out
     ranges_out: wp.array2d[float],
@@ -271,12 +265,12 @@ def _project_kernel(
             for column in range(wp.max(start, begin), wp.min(stop, end)):
                 _cut(
                     corners[f, 0], corners[f, 1], corners[f, 2], sines[column], cosines[column], slopes,
-                    max_range, near, column, ranges_out,
+                    max_range, column, ranges_out,
                 )  # fmt: skip
             for column in range(begin, wp.min(stop - width, end)):
                 _cut(
                     corners[f, 0], corners[f, 1], corners[f, 2], sines[column], cosines[column], slopes,
-                    max_range, near, column, ranges_out,
+                    max_range, column, ranges_out,
                 )  # fmt: skip
 
 
@@ -296,10 +290,10 @@ def project_triangles(
         rotation: (3, 3) from the sensor's axes to those of that frame.
         elevations: (H,) rad, of the rows, within ±90 degrees.
         azimuths: (W,) rad, of the columns, all different, within one turn.
-        max_range: Metres; farther surfaces are not seen.
+        max_range: Metres. Surfaces farther away are not seen.
 
     Returns:
-        (H, W) float32 metres; 0 where nothing is met.
+        (H, W) float32 metres, 0 where nothing is met.
     """
     device = clusters.corners.device
     azimuths, column_order = azimuths.to(device).double().sort()
@@ -308,13 +302,13 @@ def project_triangles(
     corners = torch.empty(len(seen) * int(_SIZE), 3, 3, device=device)
     columns = torch.empty(len(corners), 2, dtype=torch.int32, device=device)
     placement = [wp.vec3(*origin.tolist()), wp.mat33(*rotation.T.flatten().tolist())]
-    inputs = [seen, clusters.corners, *placement, azimuths.float(), slopes, max_range, _MARGIN]
+    inputs = [seen, clusters.corners, *placement, azimuths.float(), slopes, max_range]
     launch(_find_columns_kernel, len(corners), inputs, [corners, columns])
     ranges = torch.empty(len(azimuths), len(slopes), device=device)
     tables = [azimuths.sin().float(), azimuths.cos().float(), slopes]
     blocks = _BLOCKS_PER_CORE * torch.get_num_threads() if device.type == "cpu" else len(azimuths)
     span = -(-len(azimuths) // blocks)
-    inputs = [corners, columns, *tables, max_range, _NEAR, span]
+    inputs = [corners, columns, *tables, max_range, span]
     launch(_project_kernel, -(-len(azimuths) // span), inputs, [ranges], least=1)
     image = torch.empty_like(ranges.T).contiguous()
     image[row_order.unsqueeze(1), column_order] = ranges.T
@@ -322,7 +316,7 @@ def project_triangles(
 
 
 def within_reach(clusters: Clusters, origin: torch.Tensor, max_range: float) -> int:
-    """Counts the triangles of the clusters that begin within `max_range` [m] of an origin (3,) [m]."""
+    """Counts the triangles in clusters that begin within `max_range` [m] of an origin (3,) [m]."""
     distance = (clusters.centres - origin.float()).norm(dim=1)
     return int((distance - clusters.radii <= max_range).sum()) * int(_SIZE)
 
@@ -330,7 +324,7 @@ def within_reach(clusters: Clusters, origin: torch.Tensor, max_range: float) -> 
 def _seen(
     clusters: Clusters, origin: torch.Tensor, rotation: torch.Tensor, elevations: torch.Tensor, max_range: float
 ) -> torch.Tensor:
-    """Numbers (K,) int32 of the clusters within reach and between the highest and the lowest row, nearest first."""
+    """Numbers (K,) int32 of the clusters within reach and between the lowest and the highest row, nearest first."""
     away = clusters.centres - origin.float()
     distance = away.norm(dim=1)
     height = away @ rotation[:, 2].float()

@@ -145,7 +145,7 @@ def test_backward_twice_gives_the_same_gradient_bit_for_bit(device):
         (torch.ones(0, 4, 5), torch.ones(7, 2), "none of them 0"),
         (torch.ones(2, 4, 5).int(), torch.ones(7, 2), "features is torch.int32"),
         (torch.ones(2, 4, 5), torch.ones(7), r"queries has shape \(7,\)"),
-        (torch.ones(2, 4, 5), [1.0, 2.0], "queries is a list"),
+        (torch.ones(2, 4, 5), [1.0, 2.0], "queries is list"),
     ],
 )
 def test_bad_arguments_are_named(features, queries, message):
