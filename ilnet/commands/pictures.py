@@ -3,15 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image, ImageDraw, ImageFont
 
 from ilnet.commands import plot
-from ilnet.scan import Scan
 from ilnet.sensor import preset
-from ilnet.world import simulate
-from ilnet.world.towns import SENSOR_HEIGHT, Town, build, traffic
-from kernels import Mesh
+from ilnet.world import places, simulate
+from ilnet.world.towns import Town
 
 __all__ = ["draw"]
 
@@ -58,14 +55,15 @@ def draw(names: list[str], out: Path) -> list[Path]:
     """
     files, scans, panels = [], {}, []
     for name in names:
-        town = build(name)
+        place = places.town(name, device=simulate.best_device())
+        town = place.town
+        assert town is not None
         out.mkdir(parents=True, exist_ok=True)
         number = int(_VIEWPOINTS[name] * len(town.waypoints))
-        at = town.waypoints[number] + np.array([0, 0, SENSOR_HEIGHT], dtype=np.float32)
-        heading = float(town.headings[number])
-        about = traffic(town, at, 0)
-        above, street = _from_above(town), _from_the_street(town, about, at, heading)
-        scans[name] = _scan(town, about, at, heading)
+        at = place.position(number)
+        scans[name] = simulate.scan(place.world(at, 0), _SENSOR, place.pose(number))
+        above = _from_above(town)
+        street = _from_the_street(town, place.traffic(at, 0), at.numpy(), float(town.headings[number]))
         panels.append((f"{name}: {len(town.triangles) / 1e6:.2f} M triangles", above, street))
         for view, picture in (("above", above), ("street", street)):
             files.append(out / f"{name}_{view}.jpg")
@@ -77,14 +75,6 @@ def draw(names: list[str], out: Path) -> list[Path]:
     Image.open(files[-2]).convert("RGB").quantize(96).save(files[-2], optimize=True)
     _sheet(panels).save(files[-1], optimize=True)
     return files
-
-
-def _scan(town: Town, about: tuple[np.ndarray, np.ndarray], at: np.ndarray, heading: float) -> Scan:
-    """Returns a scan of a town with its traffic, from a sensor at `at` (3,) [m] that looks along `heading` [rad]."""
-    vertices = np.concatenate([town.vertices, about[0]])
-    triangles = np.concatenate([town.triangles, about[1] + len(town.vertices)])
-    mesh = Mesh(vertices, triangles, simulate.best_device())
-    return simulate.scan(mesh, _SENSOR, simulate.pose(torch.tensor(at), heading))
 
 
 def _surface(vertices: np.ndarray, triangles: np.ndarray, paint: np.ndarray):
@@ -185,11 +175,11 @@ def _from_above(town: Town) -> Image.Image:
     return _render(surfaces, camera, 36, _ABOVE, (reach, 8 * reach), 8.0)
 
 
-def _from_the_street(town: Town, about: tuple[np.ndarray, np.ndarray], at: np.ndarray, heading: float) -> Image.Image:
-    """Returns a picture of what lies ahead of the sensor at `at` (3,) [m]."""
+def _from_the_street(town: Town, traffic: tuple[np.ndarray, np.ndarray], at: np.ndarray, heading: float) -> Image.Image:
+    """Returns a picture of what lies ahead of the sensor at `at` (3,) [m], with its traffic."""
     surfaces = [_painted(town), _lanes(town)]
-    if len(about[1]):
-        surfaces.append(_surface(*about, np.array(_COLOURS["traffic"])))
+    if len(traffic[1]):
+        surfaces.append(_surface(*traffic, np.array(_COLOURS["traffic"])))
     ahead = at + 10 * np.array([np.cos(heading), np.sin(heading), 0])
     return _render(surfaces, [tuple(at), tuple(ahead), (0, 0, 1)], 52, _STREET, (0.3, 900), 1.0)
 
