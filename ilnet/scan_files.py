@@ -27,7 +27,7 @@ import torch
 from ilnet.scan import Scan, real_tensor
 from ilnet.sensor import Sensor, preset
 
-__all__ = ["read", "write"]
+__all__ = ["UnknownSensor", "read", "write"]
 
 
 def read(path: str | Path, sensor: Sensor | None = None) -> Scan:
@@ -188,9 +188,13 @@ def _read_pcd(path: Path, sensor: Sensor | None) -> Scan:
     return Scan.from_points(unpackers[layout](body, fields, count), sensor)
 
 
+class UnknownSensor(ValueError):
+    """A file does not hold the angles of its rays, and no sensor was named; the cause of the error of `read`."""
+
+
 def _required(sensor: Sensor | None) -> Sensor:
     if sensor is None:
-        raise ValueError(
+        raise UnknownSensor(
             "it does not hold the angles of its rays; name the sensor that measured it, such as the preset os1-128"
         )
     return sensor

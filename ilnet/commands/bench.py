@@ -1,7 +1,7 @@
-"""Benchmarks: our ops, frames, training steps and rays beside what a user would otherwise write, in one run.
+"""The command `bench`: our ops, frames, training steps and rays beside the usual ways to write them, in one run.
 
 Each pair is warmed up and then timed in turns, so that both meet the same machine; a row gives medians. "The authors'
-formulation" is the network as their code does it (paper, Figs. 2 and 3), in plain PyTorch and our own words: every
+formulation" is the network as their code computes it (paper, Figs. 2 and 3), rewritten in plain PyTorch: every
 neighbour of every query is gathered, embedded and projected, and each operation passes over all of them.
 """
 
@@ -34,14 +34,14 @@ from ilnet.world import places, simulate
 from ilnet.world.simulate import best_device
 from kernels import area_blend, gather_blend, neighbour_attention, project_pixels, reference
 
-__all__ = ["SECTIONS", "Row", "bench", "peak_memory", "table"]
+__all__ = ["SECTIONS", "Row", "peak_memory", "run", "table"]
 
 LARGE = (256, 4096)
 TOWN = "town01"
-# Queries of an op: those of a frame, and a quarter of it where each has 4 tokens of 64 numbers.
+# Queries of an op: those of a frame, or a quarter of them where each has 4 tokens of 64 channels.
 BLENDS, TOKENS = 262_144, 65_536
 TRAIN_SCANS, TRAIN_QUERIES = 4, 16_384
-# Cast in one call: a GPU has room for several.
+# Scans cast in one call: a GPU has room for several.
 SCANS = {"cpu": 1, "cuda": 16}
 CHUNK = 2048
 
@@ -57,18 +57,18 @@ class Row:
     ours_s: float
     """Seconds, median."""
     other: str
-    """What the other is, in plain words."""
+    """Name of the other way to do it."""
     other_s: float
     ratio: float
     """other_s / ours_s."""
     max_abs_diff: float
-    """Between the two results, in their unit."""
+    """Largest difference between the two results, in their unit."""
     peak_mb: float | None = None
-    """What ours took beyond what it found and returned, where it was measured."""
+    """Peak memory of ours, without its inputs and results; None where it was not measured."""
     mean_abs_diff: float = field(default=0.0, kw_only=True)
 
     def json(self) -> dict[str, Any]:
-        """The row as JSON values."""
+        """Returns the row as JSON values."""
         values = asdict(self)
         del values["mean_abs_diff"]
         return values
@@ -78,15 +78,15 @@ Work = Callable[[], list[torch.Tensor]]
 
 
 def _compare(name: str, size: str, ours: Work, others: dict[str, Work], repeat: int = 1) -> Iterator[Row]:
-    """Times `ours` and each of the others in turns, `repeat` calls in each of the rounds; one row for each other."""
+    """Times `ours` and each of the others in turns, `repeat` calls per round; yields one row for each other."""
     for words, other in others.items():
         # Other libraries answer on the CPU, whatever our device is.
         results = [torch.cat([part.detach().float().cpu().flatten() for part in work()]) for work in (ours, other)]
         times: tuple[list[float], list[float]] = ([], [])
         for _ in range(ROUNDS):
             for work, seconds in zip((ours, other), times, strict=True):
-                time.sleep(0.1)  # torch's threads stay awake for a while, on cores that the next one wants
-                for _ in range(repeat // 5):  # back to its warm state; what takes long is not as sensitive
+                time.sleep(0.1)  # torch's threads stay awake for a while, on cores that the next one needs
+                for _ in range(repeat // 5):  # warm up again; long runs are less sensitive
                     work()
                 for _ in range(repeat):
                     _wait()
@@ -105,7 +105,7 @@ def _wait() -> None:
 
 
 def _compiled(work: Callable[..., torch.Tensor], device: torch.device) -> Callable[..., torch.Tensor] | None:
-    """`torch.compile` of a function where its default backend finds a compiler, else None."""
+    """Returns `torch.compile` of a function; None if its default backend finds no compiler."""
     if device.type == "cpu" and not (shutil.which("g++") or shutil.which("clang++")):
         return None
     return torch.compile(work, fullgraph=True)
@@ -128,7 +128,7 @@ def _no_gradients(work: Callable[..., torch.Tensor]) -> Work:
 
 
 def ops() -> Iterator[Row]:
-    """The fused ops beside plain PyTorch."""
+    """Times the fused ops beside plain PyTorch."""
     device = best_device()
     torch.manual_seed(0)
     source, target = PAPER_INPUT, PAPER_TARGET
@@ -195,7 +195,7 @@ def _both(
 
 
 def _grid_sample(image: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
-    """Bilinear interpolation as torch has it: corners are pixel centres, the first column follows the last."""
+    """Returns torch's bilinear interpolation: corners are pixel centres, and the first column follows the last."""
     closed = torch.cat((image, image[..., :1]), -1).unsqueeze(1)
     size = queries.new_tensor([image.shape[1] - 1, image.shape[2]])
     grid = (queries % size.new_tensor([math.inf, image.shape[2]])) * (2 / size) - 1
@@ -211,7 +211,7 @@ def _our_attention(model: models.ILN, features: torch.Tensor, queries: torch.Ten
 
 
 def _embed(model: models.ILN, features: torch.Tensor, queries: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Tokens (N, 4, C) of all queries, and the pixels they came from."""
+    """Returns the tokens (N, 4, C) of all queries, and the pixels that they came from."""
     batch, _, height, width = features.shape
     rows, columns, offsets = reference.neighbours(queries, height, width, True)
     images = torch.arange(batch, device=features.device).view(-1, 1, 1)
@@ -221,7 +221,7 @@ def _embed(model: models.ILN, features: torch.Tensor, queries: torch.Tensor) -> 
 
 
 def _attention(attention: Any, x: torch.Tensor) -> torch.Tensor:
-    """A pre-norm attention step on tokens (N, 4, C)."""
+    """Returns tokens (N, 4, C) after a pre-norm attention step."""
     q, k, v = attention.qkv(attention.norm(x)).view(len(x), 4, 3, attention.heads, -1).permute(2, 0, 3, 1, 4)
     weights = (q @ k.transpose(-1, -2) / math.sqrt(q.shape[-1])).softmax(-1)
     return x + attention.out((weights @ v).transpose(1, 2).reshape(x.shape))
@@ -258,7 +258,7 @@ def _plain_frame(model: models.ILN, image: torch.Tensor, queries: torch.Tensor, 
 
 
 def frame() -> Iterator[Row]:
-    """A frame of ILN at D = 1, from the scan to the ranges."""
+    """Times a frame of ILN at D = 1, from the scan to the ranges."""
     device = best_device()
     torch.manual_seed(0)
     model = models.ILN().eval().to(device)
@@ -267,7 +267,7 @@ def frame() -> Iterator[Row]:
     source, target = scan.sensor, PAPER_TARGET
     for precision in models.PRECISIONS:
         for wanted in (target, target.resize(*LARGE)):
-            whole = wanted is target  # the large one whole would take 6 GB
+            whole = wanted is target  # all queries of the large frame at once would take 6 GB
             chunks = {f"the authors' formulation, {CHUNK} queries at a time": CHUNK}
             if whole:
                 chunks = {"the authors' formulation": math.prod(wanted.shape), **chunks}
@@ -291,7 +291,7 @@ def _frame(upsampler: models.Upsampler, scan: Scan) -> list[torch.Tensor]:
 
 
 def train() -> Iterator[Row]:
-    """A step of training: encoder, decoder, L1, their gradients and Adam, in bfloat16 where `ilnet train` uses it."""
+    """Times a training step: encoder, decoder, L1, gradients and Adam, in bfloat16 where `ilnet train` uses it."""
     device = best_device()
     torch.manual_seed(0)
     model = models.ILN().train().to(device)
@@ -326,7 +326,7 @@ def train() -> Iterator[Row]:
 
 
 def _draw_batches(model: models.ILN, optimizer: torch.optim.Optimizer, device: torch.device) -> Iterator[Row]:
-    """What it takes to draw a batch of continuous rays, beside the step of training that it is for."""
+    """Times drawing a batch of continuous rays beside the training step that uses it."""
     size = training.PRESETS["tiny"]
     place = places.town(TOWN, 0, device)
     rays = data.ContinuousRays([place], PAPER_INPUT, size.crops, size.columns, size.queries, seed=0)
@@ -334,7 +334,7 @@ def _draw_batches(model: models.ILN, optimizer: torch.optim.Optimizer, device: t
     batch = next(batches)
     image, queries, truth = (tensor.to(device) for tensor in (batch.image, batch.queries, batch.ranges))
 
-    nothing = [torch.zeros(1)]  # they have no result in common
+    nothing = [torch.zeros(1)]  # there is no common result to compare
 
     def draw() -> list[torch.Tensor]:
         next(batches)
@@ -358,7 +358,7 @@ def _draw_batches(model: models.ILN, optimizer: torch.optim.Optimizer, device: t
 
 
 def rays() -> Iterator[Row]:
-    """Scans cast in a town, beside Open3D's and embreex's rays where these are installed."""
+    """Times scans cast in a town, beside Open3D and embreex where these are installed."""
     device = best_device()
     place = places.town(TOWN, 0, device)
     poses = torch.stack([place.pose(number) for number in range(0, 100 * SCANS[device.type], 100)])
@@ -385,7 +385,7 @@ def _project(place: places.Place, sensor: Sensor, poses: torch.Tensor) -> list[t
 
 
 def _embree(place: places.Place, sensor: Sensor, poses: torch.Tensor) -> dict[str, Work]:
-    """The same rays by other libraries, for those that are installed; they are given the rays ready-made."""
+    """Returns casts of the same rays by the other libraries that are installed; making the rays is not timed."""
     directions = (sensor.directions().view(-1, 3).double() @ poses[:, :3, :3].mT).float()
     origins = poses[:, None, :3, 3].float().expand_as(directions)
     rays = torch.cat((origins, directions), 2).view(-1, 6).numpy()
@@ -423,7 +423,7 @@ def _on_one_core(work: Work) -> list[torch.Tensor]:
 
 
 def peak_memory(work: Work, device: torch.device) -> float | None:
-    """MB that `work` takes at most beyond what is taken before and what it returns; None where this cannot be told."""
+    """Returns the peak memory of `work` [MB], without what was there before and what it returns; None if unknown."""
     work()
     gc.collect()
     if device.type == "cuda":
@@ -435,8 +435,8 @@ def peak_memory(work: Work, device: torch.device) -> float | None:
         return (torch.cuda.max_memory_allocated() - before - sum(part.nbytes for part in result)) / 1e6
     try:
         with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL(None).malloc_trim(0)  # what was freed, but kept for later, would hide what is taken anew
-        Path("/proc/self/clear_refs").write_text("5")  # forget the highest mark
+            ctypes.CDLL(None).malloc_trim(0)  # freed memory that is kept for later would hide new allocations
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
         before = _status("VmRSS")
         result = work()
         return (_status("VmHWM") - before - sum(part.nbytes for part in result)) / 1e6
@@ -445,7 +445,7 @@ def peak_memory(work: Work, device: torch.device) -> float | None:
 
 
 def _status(entry: str) -> int:
-    """Bytes that Linux states of this process."""
+    """Returns an entry of Linux's status of this process, in bytes."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(entry + ":"):
             return int(line.split()[1]) * 1024
@@ -455,11 +455,11 @@ def _status(entry: str) -> int:
 SECTIONS: dict[str, Callable[[], Iterator[Row]]] = {"ops": ops, "frame": frame, "train": train, "rays": rays}
 
 
-def bench(sections: tuple[str, ...]) -> list[Row]:
+def run(sections: tuple[str, ...]) -> list[Row]:
     """Runs benchmarks, with a progress bar on stderr.
 
     Args:
-        sections: Some of `SECTIONS`; none stands for all.
+        sections: Some of `SECTIONS`, or none for all of them.
 
     Returns:
         The rows in the order in which they were measured.
@@ -475,7 +475,7 @@ def bench(sections: tuple[str, ...]) -> list[Row]:
 
 
 def table(rows: list[Row]) -> str:
-    """The rows for people."""
+    """Returns the rows as a text table."""
     lines = [("benchmark", "size", "ours", "other", "", "ratio", "largest (mean) difference", "peak")]
     for r in rows:
         difference = f"{r.max_abs_diff:.1e} ({r.mean_abs_diff:.0e})"

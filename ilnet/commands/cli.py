@@ -63,17 +63,17 @@ def demo(
         raise click.UsageError("--mesh FILE and --at X Y Z go together")
     if not scan and (rows is not None or sensor is not None):
         raise click.UsageError("--rows and --sensor go with --scan FILE")
-    from ilnet.commands import demo as demonstration
+    from ilnet.commands import demo
     from ilnet.learning import evaluate
     from ilnet.sensor import PAPER_TARGET
 
     if mesh and at:
         [pair], source = evaluate.mesh_pairs(mesh, [at], PAPER_TARGET), mesh.name
     elif scan:
-        pair, source = evaluate.scan_pair(scan, 16 if rows is None else rows, sensor), scan.name
+        pair, source = _scan_pair(scan, rows, sensor), scan.name
     else:
-        pair, source = demonstration.from_town(), demonstration.TOWN
-    result = demonstration.demo(*pair, out, source)
+        pair, source = demo.from_town(), demo.TOWN
+    result = demo.run(*pair, out, source)
     if as_json:
         click.echo(json.dumps(result))
         return
@@ -103,17 +103,17 @@ def train(
 
     `torchrun --nproc-per-node N -m ilnet train MODEL` shares each batch among N processes or GPUs.
     """
-    from ilnet.learning import train as training
+    from ilnet.learning import train
     from ilnet.sensor import PAPER_INPUT, PAPER_TARGET
 
     if size and not data:
         raise click.UsageError("--size goes with --data DIR")
-    if not data and training.learns_from_images(model, preset):
+    if not data and train.learns_from_images(model, preset):
         raise click.UsageError(
             f"{model} with preset {preset} learns from stored images: make some with `python -m ilnet simulate "
             f"--sizes {PAPER_INPUT.size},{PAPER_TARGET.size} --out DIR`, and name them with --data DIR"
         )
-    figures = training.train(model, preset, out, steps, seed, data, size or PAPER_TARGET.shape)
+    figures = train.train(model, preset, out, steps, seed, data, size or PAPER_TARGET.shape)
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
 
 
@@ -161,7 +161,7 @@ def evaluate(
     loaded = {name: models.load(name) for name in names}
     output = PAPER_INPUT.resize(*(size or PAPER_TARGET.shape))
     if scan:
-        pairs = [evaluate.scan_pair(scan, 16 if rows is None else rows, sensor)]
+        pairs = [_scan_pair(scan, rows, sensor)]
     elif scene in towns.NAMES:
         if at:
             raise click.UsageError("--at goes with a mesh; a town has its own waypoints")
@@ -184,7 +184,7 @@ def evaluate(
     click.echo(_table({result["model"]: result for result in results}))
 
 
-@cli.command("upsample")
+@cli.command()
 @click.argument("source", metavar="IN", type=Path)
 @click.argument("out", metavar="OUT", type=Path)
 @click.option("--size", type=_Size(), help="Rays to predict, over the same field of view.")
@@ -198,7 +198,7 @@ def evaluate(
     help="Format of the files in a folder OUT; npz by default.",
 )
 @click.pass_context
-def upsample_(
+def upsample(
     context: click.Context,
     source: Path,
     out: Path,
@@ -218,9 +218,8 @@ def upsample_(
     from ilnet.sensor import preset
 
     target = size or preset(str(sensor))
-    written, failed = upsample.upsample(
-        source, out, models.load(name), target, preset(origin) if origin else None, f".{suffix or 'npz'}"
-    )
+    sensors = target, preset(origin) if origin else None
+    written, failed = upsample.run(source, out, models.load(name), *sensors, f".{suffix or 'npz'}")
     if written:
         click.echo(f"{written} scan(s) written to {out}" + (f", {failed} could not be: see above" if failed else ""))
     if failed:
@@ -303,10 +302,10 @@ def simulate(
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON list instead of the table.")
 def bench(sections: tuple[str, ...], as_json: bool) -> None:
     """Time our ops, frames, training steps and rays beside the usual ways to write them; by default all of them."""
-    from ilnet.commands import bench as benchmarks
+    from ilnet.commands import bench
 
-    rows = benchmarks.bench(sections)
-    click.echo(json.dumps([row.json() for row in rows], indent=1) if as_json else benchmarks.table(rows))
+    rows = bench.run(sections)
+    click.echo(json.dumps([row.json() for row in rows], indent=1) if as_json else bench.table(rows))
 
 
 @cli.command()
@@ -345,9 +344,7 @@ def survey(
     found = "[\n" + ",\n".join(map(json.dumps, survey.records(entries))) + "\n]"
     survey.draw(entries, out / "survey.png")
     (out / "survey.json").write_text(found + "\n")
-    click.echo(
-        found if as_json else f"{survey.table(entries)}\n\nfigure and numbers: {out}/survey.png, survey.json"
-    )
+    click.echo(found if as_json else f"{survey.table(entries)}\n\nfigure and numbers: {out}/survey.png, survey.json")
 
 
 @cli.command()
@@ -396,16 +393,29 @@ def experiment(
     """Run the paper's experiments and ours: CSV, figures, RESULTS.md. An interrupted run goes on where it stopped."""
     if not names:
         raise click.UsageError("name some experiments, or all")
-    from ilnet.commands import experiment as experiments
+    from ilnet.commands import experiment
 
-    chosen = tuple(experiments.EXPERIMENTS) if "all" in names else names
+    chosen = tuple(experiment.EXPERIMENTS) if "all" in names else names
     for name, option, value in (("rays", "--data DIR", data), ("real", "--measured FILE", measured)):
         if name in chosen and not value:  # said before hours of training, not after
             raise click.UsageError(f"{name} needs {option}")
-    study = experiments.Study(preset, out, scans, seeds, data, measured)
+    study = experiment.Study(preset, out, scans, seeds, data, measured)
     for name in chosen:
-        experiments.EXPERIMENTS[name](study)
-        click.echo(experiments.results(study))
+        experiment.EXPERIMENTS[name](study)
+        click.echo(experiment.results(study))
+
+
+def _scan_pair(scan: Path, rows: int | None, sensor: str | None) -> tuple[Any, Any]:
+    """Returns what `evaluate.scan_pair` does; if the file lacks its sensor, the error names the option."""
+    from ilnet.learning import evaluate
+    from ilnet.scan_files import UnknownSensor
+
+    try:
+        return evaluate.scan_pair(scan, 16 if rows is None else rows, sensor)
+    except ValueError as error:
+        if isinstance(error.__cause__, UnknownSensor):
+            raise click.UsageError(f"{error}: --sensor NAME") from error
+        raise
 
 
 def _table(methods: dict[str, dict[str, Any]]) -> str:

@@ -1,4 +1,4 @@
-"""The whole path once: a scan, its upsampled versions, their figures and pictures."""
+"""The command `demo`: a scan, its upsampled versions, their figures and pictures."""
 
 from pathlib import Path
 from typing import Any
@@ -10,33 +10,33 @@ from ilnet.scan import Pair, Scan
 from ilnet.sensor import PAPER_INPUT, PAPER_TARGET
 from ilnet.world import places, simulate
 
-__all__ = ["METHODS", "TOWN", "demo", "from_town"]
+__all__ = ["METHODS", "TOWN", "from_town", "run"]
 
 METHODS = ("nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-prior")
-# No network was trained here, nor any choice made.
+# A test town: no network was trained and nothing was chosen in it.
 TOWN = "town10"
 _WAYPOINT = 1400
 
 
 def from_town() -> Pair:
-    """A scan of 16×1024 in the embedded town, and what 128×2048 rays measure there."""
+    """Returns a scan of 16×1024 rays in the town, and one of 128×2048 rays at the same pose."""
     place = places.town(TOWN, device=simulate.best_device())
     pose = place.pose(_WAYPOINT)
     world = place.world(pose[:3, 3], seed=0)
     return simulate.scan(world, PAPER_INPUT, pose), simulate.scan(world, PAPER_TARGET, pose)
 
 
-def demo(scan: Scan, truth: Scan, out: Path, source: str) -> dict[str, Any]:
+def run(scan: Scan, truth: Scan, out: Path, source: str) -> dict[str, Any]:
     """Upsamples a scan with every method, measures and draws the results.
 
     Args:
-        scan: What the methods see.
-        truth: What they should predict.
-        out: Folder for the pictures and the point cloud; made where missing.
-        source: What the scan was taken from, for titles.
+        scan: The scan that the methods see.
+        truth: The scan that they should predict.
+        out: Folder for the pictures and the point cloud; made if it is missing.
+        source: Name of the scene, for titles.
 
     Returns:
-        `methods`: for each method its `metrics.compare`; `input` and `output`: the sizes of the scans.
+        A dict: `methods` holds the figures of `metrics.compare` by method; `input` and `output` are the sizes.
     """
     out.mkdir(parents=True, exist_ok=True)
     figures, upsampled = {}, {}

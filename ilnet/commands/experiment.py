@@ -1,7 +1,7 @@
-"""The experiments of the paper (Sec. III), and ours: each trains what it needs and writes numbers, a figure and a page.
+"""The command `experiment`: experiments of the paper (Sec. III) and ours. Each writes numbers, a figure and a page.
 
-What is trained stays below the output folder, so that an interrupted experiment goes on where it stopped and several
-share what they have in common. Test scans come from the towns 07 and 10, in which nothing is trained or chosen.
+Trained networks stay in the output folder, so that an interrupted experiment goes on where it stopped, and experiments
+share their networks. Test scans come from towns 07 and 10, in which nothing is trained or chosen.
 """
 
 import csv
@@ -28,7 +28,7 @@ from ilnet.world import towns
 __all__ = ["EXPERIMENTS", "Study", "results"]
 
 SIZES = ((64, 1024), (128, 2048), (256, 4096))
-# What the paper reports (Table II): MAE [m], IoU, precision, recall, F1 on CARLA's towns 07 and 10.
+# The paper's Table II: MAE [m], IoU, precision, recall, F1 in CARLA's towns 07 and 10.
 PAPER = {
     "64x1024": {
         "lidar-sr": (1.560, 0.233, 0.370, 0.377, 0.373),
@@ -50,7 +50,7 @@ PAPER = {
     },
 }
 
-# Told apart by the colour-blind, and in print.
+# Distinguishable for the colour-blind, and in print.
 _SERIES = "#0072b2", "#e69f00", "#009e73", "#cc79a7"
 _COLOURS = {"liif": "#d55e00", "iln": "#0072b2", "iln-prior": "#009e73", "lidar-sr": "#cc79a7", "bilinear": "#999999"}
 
@@ -60,14 +60,17 @@ class Study:
     """What experiments share.
 
     Attributes:
-        preset: Of each training, one of `train.PRESETS`; where None, trainings are `small`, and the networks that ship
-            with the package stand for those that are compared with other methods.
-        out: Folder for weights, numbers, figures.
-        scans: Test scans from each test town.
-        seeds: How often a training is repeated where its spread is shown.
-        archive: Stored images, for the comparison with continuous rays and for LiDAR-SR at those of `SIZES` that it
-            holds; without it these are left out.
-        measured: Files of measured scans.
+        preset: Preset of each training, one of `train.PRESETS`. If None, trainings are `small`, and other methods are
+            compared with the networks that ship with the package.
+        out: Folder for weights, numbers and figures.
+        scans: Number of test scans from each test town.
+        seeds: Number of trainings where their spread is shown.
+        archive: Stored images, to compare with continuous rays and to train LiDAR-SR at those of `SIZES` that it holds.
+            If None, both are left out.
+        measured: Files of measured scans. Their names without suffix differ, since results bear them.
+
+    Raises:
+        ValueError: If two measured files have one name.
     """
 
     preset: str | None
@@ -77,14 +80,20 @@ class Study:
     archive: Path | None = None
     measured: tuple[Path, ...] = ()
 
+    def __post_init__(self) -> None:
+        files: dict[str, Path] = {}
+        for path in self.measured:
+            if (other := files.setdefault(path.stem, path)) is not path:
+                raise ValueError(f"measured holds {other} and {path}; their names should differ: rename one of them")
+
     @cached_property
     def probe(self) -> list[Pair]:
-        """Test scans that are measured in the course of a training."""
+        """Test scans that are measured during a training."""
         output = PAPER_INPUT.resize(*SIZES[0])
         return [pair for town in towns.TEST for pair in evaluate.town_pairs(town, 4, output)]
 
     def trained(self, label: str, name: str, **options: Any) -> Path:
-        """Trains a network, unless that was done, and returns its file of weights; options are those of `train`."""
+        """Trains a network unless its weights exist; returns their file. Options are those of `train.train`."""
         folder = self.out / "weights" / label
         file = folder / f"{name}.safetensors"
         if not file.exists():
@@ -92,17 +101,17 @@ class Study:
         return file
 
     def followed(self, name: str, seed: int = 0) -> Path:
-        """The same for a network as its preset has it, with test figures in the course of its training."""
+        """Returns the same for a network with the preset's own arguments, and logs test figures during training."""
         return self.trained(f"{name}-{seed}", name, seed=seed, probe=self.probe)
 
     def networks(self) -> dict[str, str | Path]:
-        """The networks that are compared with other methods."""
+        """Returns the networks that are compared with other methods."""
         return {name: self.trained(name, name) if self.preset else name for name in ("liif", "iln", "iln-prior")}
 
     def compare(
         self, files: Mapping[str, str | Path | models.Model], sizes: Sequence[tuple[int, int]] = ()
     ) -> list[dict[str, Any]]:
-        """Measures models, by the names their rows shall bear, on the test towns; at all `SIZES` unless told."""
+        """Measures models in the test towns, at all `SIZES` by default; their rows bear the names in `files`."""
         loaded = {label: f if isinstance(f, models.Model) else models.load(f) for label, f in files.items()}
         rows = []
         for size in sizes or SIZES:
@@ -121,7 +130,7 @@ class Study:
         return ", ".join(steps)
 
     def write(self, name: str, rows: Sequence[dict[str, Any]]) -> None:
-        """Writes rows of one kind as NAME.csv, and in about.json what they were made with."""
+        """Writes rows to NAME.csv, and to about.json what they were made with."""
         self.out.mkdir(parents=True, exist_ok=True)
         shipped = self.preset is None and name in ("table", "real")
         trained = f"networks trained with preset {self.preset or 'small'}"
@@ -167,7 +176,7 @@ def table(study: Study) -> None:
 
 
 def _draw_points(study: Study, size: tuple[int, int], files: Mapping[str, str | Path]) -> None:
-    """The same crop of a test scan by every method, as points."""
+    """Draws the same crop of a test scan by every method, as points."""
     for town in towns.TEST:
         [(sparse, dense)] = evaluate.town_pairs(town, 1, PAPER_INPUT.resize(*size))
         shown = {"input": sparse}
@@ -177,7 +186,7 @@ def _draw_points(study: Study, size: tuple[int, int], files: Mapping[str, str | 
 
 
 def convergence(study: Study) -> None:
-    """The paper's figure of convergence: test figures in the course of training, over several seeds."""
+    """The paper's figure of convergence: test figures during training, over several seeds."""
     rows: list[dict[str, Any]] = []
     for name in ("liif", "iln"):
         for seed in range(study.seeds):
@@ -204,10 +213,10 @@ def convergence(study: Study) -> None:
 
 
 def _probed(folder: Path) -> list[dict[str, Any]]:
-    """The test figures that a training logged, each step once, though it was interrupted.
+    """Returns the test figures that a training logged, each step once even if it was interrupted.
 
-    Its `seconds` are those of its median pace, validations included, so that halts and other work of the machine do
-    not count.
+    The `seconds` follow from its median pace, validations included, so that halts and other work on the machine do not
+    count.
     """
     found: dict[int, dict[str, Any]] = {}
     for log in folder.glob("from-step-*/metrics.csv"):
@@ -224,10 +233,14 @@ def _probed(folder: Path) -> list[dict[str, Any]]:
 
 
 def steps_to_reach(rows: Sequence[dict[str, Any]], share: float = 0.1) -> dict[str, float]:
-    """How many more steps LIIF takes to the IoU that ILN has after a share of its budget, means over seeds.
+    """Compares how many steps LIIF and ILN take to the IoU that ILN has after a share of its budget.
+
+    Args:
+        rows: Rows of `convergence`; figures are means over their seeds.
+        share: Share of ILN's steps, 0 to 1.
 
     Returns:
-        `iou` that ILN has then, its `iln_steps`, `liif_steps` (infinite where LIIF never gets there), their `ratio`.
+        `iou` of ILN then, its steps `iln_steps`, `liif_steps` (infinite if LIIF never gets there), and their `ratio`.
     """
     curves: dict[str, dict[int, float]] = {}
     for name in ("liif", "iln"):
@@ -269,7 +282,7 @@ def _frame_time(model: models.Model) -> float:
 
 
 def prior(study: Study) -> None:
-    """Ours: a geometric prior on the weights, and answers that snap to planes."""
+    """Ours: a geometric prior on the weights, and ranges that snap to planes."""
     files: dict[str, models.Model] = {}
     usual = models.create("iln-prior")
     assert isinstance(usual, models.ILN)
@@ -307,7 +320,7 @@ def rays(study: Study) -> None:
 
 
 def _bars(study: Study, name: str, rows: Sequence[dict[str, Any]], by: str, title: str) -> None:
-    """Draws IoU and MAE by size; kinds that differ behind a comma only share a colour."""
+    """Draws IoU and MAE by size; kinds that differ only after a comma share a colour."""
     figure = Figure(figsize=(9, 3), layout="constrained")
     for axis, (key, words) in zip(figure.subplots(1, 2), (("iou", "IoU"), ("mae", "MAE [m]")), strict=True):
         kinds = list(dict.fromkeys(str(row[by]) for row in rows))
@@ -325,7 +338,7 @@ def _bars(study: Study, name: str, rows: Sequence[dict[str, Any]], by: str, titl
 
 
 def real(study: Study) -> None:
-    """Ours: measured scans, of which the networks saw none; some beams are kept, all are predicted."""
+    """Ours: measured scans that no network saw; some beams are kept, and all are predicted."""
     if not study.measured:
         raise ValueError("no measured scans are named: give some with --measured FILE, such as frames of your sensor")
     files: dict[str, str | Path] = {name: name for name in ("bilinear", "bilinear-inverse", "planes")}
@@ -363,7 +376,7 @@ EXPERIMENTS: dict[str, Callable[[Study], None]] = {
 
 
 def results(study: Study) -> Path:
-    """Writes RESULTS.md: all that experiments left in the folder so far, as tables and figures."""
+    """Writes RESULTS.md, with tables and figures of all experiments in the folder so far; returns its path."""
     about = _about(study.out)
     done = {name: _read(study.out / f"{name}.csv") for name in EXPERIMENTS if name in about}
     lines = ["# Results", "", "Ratios of figures on the test towns, and of IoU on measured scans:", ""]
@@ -380,10 +393,10 @@ def results(study: Study) -> Path:
 
 
 def ratios(done: Mapping[str, Sequence[dict[str, Any]]]) -> list[dict[str, str]]:
-    """What the experiments are about: one row for each ratio, with the paper's beside ours.
+    """Returns one row for each ratio that the experiments are about, with the paper's beside ours.
 
     Args:
-        done: Rows of the experiments `table`, `convergence` and `real`, by name, as far as they were run.
+        done: Rows of the experiments `table`, `convergence` and `real`, by name; those that were run.
     """
     found: list[dict[str, str]] = []
 
@@ -423,7 +436,7 @@ def _read(file: Path) -> list[dict[str, Any]]:
 
 
 def _shown(name: str, rows: Sequence[dict[str, Any]]) -> Sequence[dict[str, Any]]:
-    """The rows that the page shows of an experiment: of a convergence where it ends."""
+    """Returns the rows of an experiment that the page shows; of a convergence, those at its end."""
     if name == "convergence":
         last = max(int(row["step"]) for row in rows)
         return [row for row in rows if int(row["step"]) == last]
@@ -431,7 +444,7 @@ def _shown(name: str, rows: Sequence[dict[str, Any]]) -> Sequence[dict[str, Any]
 
 
 def _beside_the_paper(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows with the paper's MAE and IoU where it has some."""
+    """Returns the rows with the paper's MAE and IoU, where it reports them."""
     found = []
     for row in rows:
         theirs = PAPER[row["size"]].get(row["model"])

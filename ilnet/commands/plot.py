@@ -10,12 +10,12 @@ from ilnet.sensor import Sensor
 
 __all__ = ["point_clouds", "range_images"]
 
-# Readable in print and by the colour-blind; far is dark, no return is white.
+# Readable in print and for the colour-blind; far is dark, no return is white.
 _COLOURS = "viridis_r"
 
 
 def _top_down(scan: Scan) -> tuple:
-    """The range image with the highest beam first and azimuth falling to the right, as one sees it; 0 as NaN."""
+    """Returns the range image as one sees it, highest beam first, azimuth falling, 0 as NaN; and its extent [deg]."""
     image = scan.ranges.cpu().numpy()
     if scan.sensor.elevations[0] < scan.sensor.elevations[-1]:
         image = image[::-1]
@@ -27,19 +27,19 @@ def _top_down(scan: Scan) -> tuple:
 
 
 def _degrees(sensor: Sensor) -> list[float]:
-    """Left, right, bottom and top of the picture in degrees."""
+    """Returns left, right, bottom and top of the picture [deg]."""
     azimuths, elevations = np.rad2deg(sensor.azimuths), np.rad2deg(sensor.elevations)
     return [azimuths.max(), azimuths.min(), elevations.min(), elevations.max()]
 
 
 def range_images(scans: dict[str, Scan], path: Path, title: str, sector: float | None = None) -> None:
-    """Draws range images under each other.
+    """Draws range images below each other.
 
     Args:
-        scans: What to draw by its caption.
-        path: A picture file; its suffix says the format.
-        title: Of the whole.
-        sector: Degrees of azimuth to show, centred on the sensor's middle column; all where None.
+        scans: Scans by their captions.
+        path: A picture file; its suffix decides the format.
+        title: Title of the whole figure.
+        sector: Azimuth to show [deg], centred on the sensor's middle column; None for all.
     """
     figure = Figure(figsize=(12, 1.35 * len(scans) + 0.8), layout="constrained")
     axes = figure.subplots(len(scans), 1, sharex=True, squeeze=False)[:, 0]
@@ -64,15 +64,17 @@ def point_clouds(scans: dict[str, Scan], path: Path, reach: float = 35.0) -> Non
     """Draws scans as points coloured by height, side by side, from one camera above and behind the sensor.
 
     Args:
-        scans: What to draw by its caption.
+        scans: Scans by their captions.
         path: A `.png` file.
-        reach: Metres around the sensor to show.
+        reach: Distance around the sensor to show [m].
     """
     import pyvista  # here and not above: it takes a second to import
 
     # Without a screen VTK warns of its absence, then renders all the same.
     with pyvista.vtk_verbosity("off"):
-        columns = min((3, 4, 5), key=lambda count: -len(scans) % count)  # that which leaves the fewest places empty
+        columns = min(
+            (3, 4, 5), key=lambda count: -len(scans) % count
+        )  # the number that leaves the fewest places empty
         rows = -(-len(scans) // columns)
         window = [600 * columns, 480 * rows]
         plotter = pyvista.Plotter(off_screen=True, shape=(rows, columns), window_size=window, border=False)

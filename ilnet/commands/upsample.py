@@ -1,4 +1,4 @@
-"""Files of scans in, files of denser scans out."""
+"""The command `upsample`: files of scans in, files of denser scans out."""
 
 import sys
 from collections.abc import Iterator
@@ -10,10 +10,10 @@ from ilnet import models, scan_files
 from ilnet.sensor import Sensor
 from ilnet.world import simulate
 
-__all__ = ["upsample"]
+__all__ = ["run"]
 
 
-def upsample(
+def run(
     source: Path,
     out: Path,
     model: models.Model,
@@ -23,21 +23,21 @@ def upsample(
 ) -> tuple[int, int]:
     """Upsamples a file, or all files of a folder, with a progress bar on stderr.
 
-    A file that cannot be upsampled is one line on stderr and does not keep the others from it. Each file is written
-    whole or not at all.
+    A file that cannot be upsampled becomes one line on stderr, and the others are upsampled all the same. Each file is
+    written whole or not at all.
 
     Args:
-        source: A file that `ilnet.scan_files.read` reads, or a folder of them; folders and hidden files in it are
+        source: A file that `ilnet.scan_files.read` reads, or a folder of such files. Folders and hidden files in it are
             left out.
-        out: The file to write, in a format of `ilnet.scan_files.write`, or where `source` is a folder the folder to
-            write to, made where missing.
-        model: What predicts.
-        target: The sensor whose scan is wanted, or its rows and columns over the field of view of each file's sensor.
-        sensor: The sensor of the files, where they do not name theirs; see `ilnet.scan_files.read`.
-        suffix: Of the files written to a folder.
+        out: The file to write, in a format of `ilnet.scan_files.write`. If `source` is a folder, the folder to write
+            to; made if it is missing.
+        model: The model that predicts; it is moved to the device of the scans.
+        target: The sensor whose scan is wanted, or rows and columns over the field of view of each file's sensor.
+        sensor: The sensor of the files, if they do not hold its angles; see `ilnet.scan_files.read`.
+        suffix: Suffix of the files written to a folder.
 
     Returns:
-        How many files were written, and how many could not be.
+        The numbers of files that were written and that could not be.
 
     Raises:
         OSError: If `source` is missing or `out` cannot be made.
@@ -52,7 +52,7 @@ def upsample(
     for path, result in tqdm(tasks, unit="scan", desc="upsample"):
         try:
             if result in written:
-                raise ValueError(f"{path}: another file of this name became {result} already; rename one")
+                raise ValueError(f"{path}: another file of this name became {result} already; rename one of them")
             scan = scan_files.read(path, sensor).to(device)
             if frames is None or frames.source != scan.sensor:
                 wanted = target if isinstance(target, Sensor) else scan.sensor.resize(*target)
@@ -62,20 +62,22 @@ def upsample(
         except (ValueError, OSError) as error:
             failed += 1
             line = " ".join(str(error).split())
+            if isinstance(error.__cause__, scan_files.UnknownSensor):
+                line += ": --from NAME"
             tqdm.write(f"error: {line if line.startswith(str(path)) else f'{path}: {line}'}", file=sys.stderr)
     return len(written), failed
 
 
 def _tasks(source: Path, out: Path, suffix: str) -> Iterator[tuple[Path, Path]]:
-    """Which file becomes which."""
+    """Yields each file to read, and the file to write."""
     if not source.is_dir():
         if out.exists() and out.samefile(source):
-            raise ValueError(f"{out} is the file to be read; give the result another name")
+            raise ValueError(f"out is {out}, the file to be read; it should be another file")
         yield source, out
         return
     out.mkdir(parents=True, exist_ok=True)
     if out.samefile(source):
-        raise ValueError(f"{out} is the folder to be read; give the results another one")
+        raise ValueError(f"out is {out}, the folder to be read; it should be another folder")
     paths = sorted(path for path in source.iterdir() if path.is_file() and not path.name.startswith("."))
     if not paths:
         raise ValueError(f"{source}: there is no file in this folder")

@@ -1,4 +1,4 @@
-"""How close a predicted range image is to the true one: in metres, as occupied voxels (paper, Sec. III-B), at edges."""
+"""Figures of a predicted range image: metres off, occupied voxels (paper, Sec. III-B), and points at edges."""
 
 from collections.abc import Callable, Iterator
 
@@ -12,25 +12,25 @@ from ilnet.sensor import Sensor
 __all__ = ["FIGURES", "VOXEL", "ScanMetrics", "compare", "edges", "floating", "voxels"]
 
 FIGURES = ("mae", "iou", "precision", "recall", "f1", "floating", "edge_mae", "flat_mae")
-# Metres: edge length of the voxels (paper, Sec. III-B).
+# Edge length of the voxels [m] (paper, Sec. III-B).
 VOXEL = 0.1
-# Metres: a point so close to a surface is on it. Several times a LiDAR's noise of centimetres, and what a bent blend
-# misses of near ground; a tenth of the metres between a car and the wall behind it.
+# A point this close to a surface is on it [m]. It is several times a LiDAR's noise of centimetres and the error of a
+# bent blend on near ground, and a tenth of the gap between a car and the wall behind it.
 MARGIN = 0.3
-# Metres: no surface is seen whose plane passes so close to the sensor. The ground under a car's does at 1.5 and more.
+# The plane of a visible surface passes the sensor at least this far away [m]; that of the ground passes it at 1.5 m.
 PLANE = 1.0
-# Pixels from the middle of the 5×5 neighbourhood to its sides: half the way between measured beams at 16 -> 64.
+# Pixels from the middle of the 5×5 neighbourhood to its sides: half the way between measured beams from 16 to 64 rows.
 REACH = 2
 
 
 def voxels(points: torch.Tensor) -> torch.Tensor:
-    """The voxels that points occupy.
+    """Returns the voxels that points occupy.
 
     Args:
-        points: (N, 3) metres.
+        points: (N, 3) metres, within 100 km of the origin.
 
     Returns:
-        (M,) int64, a number for each voxel, sorted. Voxels within 100 km of the origin are told apart.
+        (M,) int64, a number for each occupied voxel, sorted.
     """
     x, y, z = (points.double() / VOXEL).floor().long().add(1 << 20).unbind(-1)
     return torch.unique((x << 42) + (y << 21) + z)
@@ -41,21 +41,21 @@ def _returns(ranges: torch.Tensor, sensor: Sensor) -> torch.Tensor:
 
 
 def _occupied(ranges: torch.Tensor, truth: Scan) -> torch.Tensor:
-    """Voxels of the ranges (H, W) within the limits of the sensor."""
+    """Returns the voxels of those ranges (H, W) that lie within the limits of the sensor."""
     within = _returns(ranges, truth.sensor)
     return voxels(truth.sensor.directions().to(ranges.device)[within] * ranges[within].unsqueeze(-1))
 
 
 def _padded(image: torch.Tensor, wrap: bool) -> torch.Tensor:
-    """Adds REACH pixels on each side of (C, H, W): rows repeat, columns wrap around the seam or repeat."""
+    """Returns (C, H, W) with REACH more pixels on each side: rows repeat, columns wrap around the seam or repeat."""
     sides = F.pad(image.unsqueeze(0), (REACH, REACH, 0, 0), "circular" if wrap else "replicate")
     return F.pad(sides, (0, 0, REACH, REACH), "replicate").squeeze(0)
 
 
 def _pairs(truth: Scan) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Ranges of the nearer and the farther of two neighbours, and whether they part; padded, per column, then per row.
+    """Yields the nearer range of two neighbours, the farther one, and whether they part: per column, then per row.
 
-    Repeated pixels make pairs of equal ranges, which part nowhere and add no surface.
+    All are padded. Repeated pixels make pairs of equal ranges, which never part and add no surface.
     """
     ranges = truth.filled()
     points = truth.sensor.directions().to(ranges.device) * ranges.unsqueeze(-1)
@@ -64,33 +64,36 @@ def _pairs(truth: Scan) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tens
         count = padded.shape[axis] - 1
         one, other = padded.narrow(axis, 0, count), padded.narrow(axis, 1, count)
         low, high = torch.minimum(one[3], other[3]), torch.maximum(one[3], other[3])
-        # Squares of twice the area of the triangle of both points and the sensor, and of one just as high as PLANE.
+        # Squares of twice the areas of two triangles: of both points and the sensor, and of one with the height PLANE.
         area = torch.linalg.cross(one[:3], other[:3], dim=0).square().sum(0)
         largest = (PLANE * (one[:3] - other[:3])).square().sum(0)
         yield low, high, (high - low > 2 * MARGIN) & (area < largest)
 
 
 def _windows(image: torch.Tensor, truth: Scan) -> torch.Tensor:
-    """The neighbourhood (H, W, h, w) of each pixel, a view of a padded image; pairs fill one less row or column."""
+    """Returns a view (H, W, h, w) of each pixel's neighbourhood in a padded image; pairs lack one row or column."""
     height, width = (padded - count + 1 for padded, count in zip(image.shape, truth.sensor.shape, strict=True))
     return image.unfold(0, height, 1).unfold(1, width, 1)
 
 
 def _over_windows(reduce: Callable[..., torch.Tensor], image: torch.Tensor, truth: Scan) -> torch.Tensor:
-    """Reduces the neighbourhood (H, W) of each pixel, rows first, then columns: a tenth of the time of both at once."""
+    """Returns each pixel's neighbourhood reduced, (H, W): rows, then columns, ten times as fast as both at once."""
     height, width = _windows(image, truth).shape[2:]
     return reduce(reduce(image.unfold(0, height, 1), dim=-1).unfold(1, width, 1), dim=-1)
 
 
 def edges(truth: Scan) -> torch.Tensor:
-    """Tells the pixels near a range edge from the others.
+    """Returns which pixels are near a range edge.
 
-    Two pixels i, j next to each other in a row or a column, with true ranges t_i, t_j (no return is `norm_range`) and
-    points p_i, p_j, *part* where |t_i - t_j| > 2 m and |p_i × p_j| / |p_i - p_j| < D, with m = 0.3 m and D = 1 m: where
-    the gap has room for a point that is on neither side, and the straight line through both passes the sensor closer
-    than D, so that no surface in sight holds both. Ground seen at a grazing angle has large gaps as well, but its lines
-    pass the sensor as far away as the ground itself. A pixel is at an edge where two pixels of its 5×5 neighbourhood
-    part. Columns wrap on a full circle.
+    Take two pixels i, j next to each other in a row or a column, with true ranges t_i, t_j (no return is `norm_range`)
+    and points p_i, p_j. They *part* where |t_i - t_j| > 2 m and |p_i × p_j| / |p_i - p_j| < D, with m = 0.3 m and
+    D = 1 m. The first says that the gap has room for a point on neither side. The second says that the straight line
+    through both points passes the sensor closer than D, so that no visible surface holds both. Ground at a grazing
+    angle has large gaps too, but its lines pass the sensor as far away as the ground itself. A pixel is at an edge
+    where two pixels of its 5×5 neighbourhood part. Columns wrap on a full circle.
+
+    Args:
+        truth: The scan whose ranges are taken as true.
 
     Returns:
         (H, W) bool.
@@ -100,16 +103,15 @@ def edges(truth: Scan) -> torch.Tensor:
 
 
 def floating(ranges: torch.Tensor, truth: Scan) -> torch.Tensor:
-    """Finds the predicted points that float in empty space between two surfaces.
+    """Returns which predicted points float in empty space between two surfaces.
 
-    The surfaces that a pixel's 5×5 neighbourhood holds are, along a ray, the set S: each true range t_i, and the
-    interval between t_i and t_j for each two neighbours that do not part (`edges`). A predicted range p floats where
-    min S < p < max S and no number in S is closer to p than m = 0.3 m. Only pixels at an edge can float, and only
-    returns do.
+    Let S be the set of ranges where a pixel's 5×5 neighbourhood holds surfaces: each true range t_i, and the interval
+    from t_i to t_j for any two neighbours that do not part (see `edges`). A predicted range p floats where
+    min S < p < max S and no number in S is closer to p than m = 0.3 m. Only returns at pixels near an edge can float.
 
     Args:
         ranges: (H, W) predicted ranges [m].
-        truth: What should have been measured, by the sensor of the prediction.
+        truth: The true scan, by the sensor of the prediction.
 
     Returns:
         (H, W) bool.
@@ -135,15 +137,15 @@ def compare(ranges: torch.Tensor, truth: Scan) -> dict[str, float]:
     """Measures predicted ranges against a scan.
 
     Args:
-        ranges: (H, W) predicted ranges [m], clipped to [0, norm_range]; near `norm_range` means no return.
-        truth: What should have been measured, by the sensor of the prediction.
+        ranges: (H, W) predicted ranges [m]; they are clipped to [0, norm_range], and near `norm_range` means no return.
+        truth: The true scan, by the sensor of the prediction.
 
     Returns:
-        The `FIGURES`, each 0 where undefined:
-        mae: Mean absolute error [m] over all pixels, no return counting as `norm_range`.
-        iou, precision, recall, f1: Of the occupied voxels of 0.1 m, ranges outside the sensor's limits left out.
+        The `FIGURES`, each 0 where it is undefined:
+        mae: Mean absolute error [m] over all pixels; no return counts as `norm_range`.
+        iou, precision, recall, f1: Figures of the occupied voxels of 0.1 m, without ranges outside the sensor's limits.
         floating: Share of the predicted returns that float between two surfaces, see `floating`.
-        edge_mae, flat_mae: The mean absolute error [m] over the pixels at range edges, see `edges`, and the others.
+        edge_mae, flat_mae: Mean absolute error [m] over the pixels near range edges, see `edges`, and over the others.
 
     Raises:
         ValueError: If the shapes differ or a prediction is not finite.
@@ -173,7 +175,7 @@ def compare(ranges: torch.Tensor, truth: Scan) -> dict[str, float]:
 
 
 class ScanMetrics(Metric):
-    """Means over scans of what `compare` measures; in several processes, over the scans of all of them."""
+    """Means of the figures of `compare` over scans; in several processes, over the scans of all of them."""
 
     full_state_update = False
     sums: torch.Tensor
@@ -181,7 +183,7 @@ class ScanMetrics(Metric):
 
     def __init__(self) -> None:
         super().__init__()
-        # Double precision, so that the figures do not depend on who added which scan.
+        # Double precision, so that the means do not depend on which process measured which scan.
         self.add_state("sums", torch.zeros(len(FIGURES), dtype=torch.float64), "sum")
         self.add_state("scans", torch.tensor(0), "sum")
 

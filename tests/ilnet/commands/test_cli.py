@@ -187,7 +187,10 @@ BAD = {
     "no rows without a scan": (["demo", "--rows", "0"], "--rows and --sensor go with --scan"),
     "millimetres": (["demo", "--scan", "millimetres.npz"], "are these metres?"),
     "folder as mesh": (["demo", "--mesh", ".", "--at", "0", "0", "0"], "is a folder"),
-    "points without sensor": (["demo", "--scan", "points.ply"], "name the sensor that measured it"),
+    "points without sensor": (
+        ["demo", "--scan", "points.ply"],
+        "name the sensor that measured it, such as the preset os1-128: --sensor NAME",
+    ),
     "unknown sensor": (["demo", "--scan", "points.ply", "--sensor", "vlp-61"], "unknown sensor 'vlp-61'"),
     "unwritable folder": (["demo", "--scan", "good.npz", "--rows", "4", "--out", "text.ply"], "text.ply"),
     "no scene": (["evaluate", "--model", "iln"], "--scene TOWN|MESH or --scan FILE"),

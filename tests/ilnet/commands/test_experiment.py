@@ -177,3 +177,12 @@ def test_what_is_missing_is_named(study):
         experiment.rays(study)
     with pytest.raises(ValueError, match=r"no measured scans are named.*--measured FILE"):
         experiment.real(study)
+
+
+def test_two_measured_files_of_one_name_are_refused_before_any_training(tmp_path, command):
+    files = [tmp_path / folder / "frame.npz" for folder in ("a", "b")]
+    with pytest.raises(ValueError, match=r"measured holds .*a/frame.npz and .*b/frame.npz; their names should differ"):
+        experiment.Study(None, tmp_path, measured=tuple(files))
+    code, out, [error] = command("experiment", "convergence", "real", "--measured", files[0], "--measured", files[1])
+    assert (code, out) == (2, "")
+    assert "their names should differ" in error

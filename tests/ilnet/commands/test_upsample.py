@@ -81,7 +81,7 @@ def test_a_bad_file_does_not_keep_the_others_from_being_done(run, seen, tmp_path
     assert code == 2
     assert out == "2 scan(s) written to out, 3 could not be: see above\n"
     assert [error.split(":")[1].strip() for error in errors] == ["in/b.npz", "in/c.pcd", "in/d.npy"]
-    assert "--from" in errors[1]
+    assert errors[1].endswith("such as the preset os1-128: --from NAME")
     assert (tmp_path / "out" / "before.npz").read_text() == (tmp_path / "out" / "b.npz").read_text() == "kept"
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.npz", "b.npz", "before.npz", "d.npz"]
 
@@ -107,8 +107,8 @@ def test_of_two_files_with_one_name_the_first_is_kept(run, tmp_path):
         (("in.npz", "out.npz", "--size", "16x256", "--model", "ilm"), "unknown model 'ilm'"),
         (("in.npz", "out.npz", "--size", "16x256", "--format", "ply"), "--format goes with a folder"),
         (("in.npz", "out.xyz", "--size", "16x256"), "unknown suffix '.xyz'"),
-        (("in.npz", "in.npz", "--size", "16x256"), "in.npz is the file to be read"),
-        ((".", ".", "--size", "16x256"), ". is the folder to be read"),
+        (("in.npz", "in.npz", "--size", "16x256"), "out is in.npz, the file to be read"),
+        ((".", ".", "--size", "16x256"), "out is ., the folder to be read"),
         (("empty", "out", "--size", "16x256"), "there is no file in this folder"),
         ((".", "in.npz", "--size", "16x256"), "in.npz"),
     ],
