@@ -11,7 +11,6 @@ import math
 import os
 import tempfile
 import threading
-from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -186,7 +185,7 @@ def _to_warp(argument: Any, annotation: Any) -> Any:
         # Fields are set in the C struct: Warp's own setters want whole Warp arrays, which are slow to make.
         for name, field in annotation.vars.items():
             value = _to_warp(argument[name], field.type)
-            setattr(struct.__ctype__(), name, value.__ctype__() if isinstance(argument[name], dict) else value)
+            setattr(struct.__ctype__(), name, value.__ctype__() if wp.types.is_struct(value) else value)
         return struct
     if not isinstance(argument, torch.Tensor):
         return argument
@@ -198,15 +197,6 @@ def _to_warp(argument: Any, annotation: Any) -> Any:
             argument = argument.squeeze(-1).unsqueeze(-1)
         return wp.from_torch(argument.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
     return wp.from_torch(argument.detach(), requires_grad=False, return_ctype=True)
-
-
-def _tensors(arguments: Iterable[tuple[str, Any]]) -> Iterator[tuple[str, torch.Tensor]]:
-    """The tensors among named arguments and among the fields of structs."""
-    for name, argument in arguments:
-        if isinstance(argument, torch.Tensor):
-            yield name, argument
-        elif isinstance(argument, dict):
-            yield from ((f"{name}.{field}", tensor) for field, tensor in _tensors(argument.items()))
 
 
 def _load(kernel: wp.Kernel, device: torch.device) -> None:
@@ -232,9 +222,9 @@ def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[Any
     Args:
         kernel: A Warp kernel without generic arguments (see `overload`).
         threads: How many threads to run.
-        inputs: The kernel's arguments after `first`: tensors, None for no array, numbers, Warp handles, and for structs
-            dicts of their fields. The vectors of an array of vectors lie one after the other in the last dimensions of
-            the tensor.
+        inputs: The kernel's arguments after `first`: tensors, None for no array, numbers, Warp handles and structs. A
+            struct with arrays is given as a dict of its fields. The vectors of an array of vectors lie one after the
+            other in the last dimensions of the tensor.
         outputs: The arguments that the kernel writes, of the same kinds.
         least: Fewest threads that are worth a core of their own.
 
@@ -246,7 +236,13 @@ def launch(kernel: wp.Kernel, threads: int, inputs: list[Any], outputs: list[Any
     if threads >= 2**31:
         raise ValueError(f"threads is {threads}; it should be below 2^31: split the queries")
     variables, values = kernel.adj.args[1:], (*inputs, *outputs)
-    tensors = dict(_tensors((v.label, value) for v, value in zip(variables, values, strict=True)))
+    tensors: dict[str, torch.Tensor] = {}
+    for variable, value in zip(variables, values, strict=True):
+        if isinstance(value, torch.Tensor):
+            tensors[variable.label] = value
+        elif isinstance(value, dict):
+            fields = {f"{variable.label}.{name}": field for name, field in value.items()}
+            tensors |= {name: field for name, field in fields.items() if isinstance(field, torch.Tensor)}
     check_devices(**tensors)
     device = next(iter(tensors.values())).device
     if (kernel, device) not in _loaded:

@@ -36,7 +36,7 @@ def cell(row: Any, column: Any, grid: Grid):
     i = wp.clamp(base(row) + 1, 0, grid.height)
     j = wp.clamp(base(column) + 1, 0, grid.width)
     if grid.wrap != 0:
-        j = column_of(base(column), grid) + 1
+        j = column_of(base(column), grid.width, 1) + 1
     return i * (grid.width + 1) + j
 
 
@@ -98,7 +98,7 @@ def _sum_gradients_kernel(
             n = n + b * (height + 1) * (width + 1)
             for t in range(4):
                 row = wp.clamp(above + t // 2, 0, height - 1)
-                if row == i and column_of(left + t % 2, grid) == j:
+                if row == i and column_of(left + t % 2, width, grid.wrap) == j:
                     for s in range(starts[n], starts[n + 1]):
                         total = total + gradients[b, order[s] - b * gradients.shape[1], t, c]
     pixels_out[b, i, j, c] = total

@@ -13,6 +13,7 @@ everywhere in `kernels`:
 `kernels.scatter` is the adjoint of the stencil.
 """
 
+from functools import lru_cache
 from typing import Any
 
 import warp as wp
@@ -32,9 +33,12 @@ class Grid:
     """1 if column W-1 meets column 0, a full circle; 0 if columns clamp."""
 
 
-def grid_of(height: int, width: int, wrap: bool) -> dict[str, int]:
-    """Returns the fields of a `Grid` for `kernels.launch.launch`: H, W, and whether columns wrap around the seam."""
-    return {"height": height, "width": width, "wrap": int(wrap)}
+@lru_cache(maxsize=128)  # the same few sizes in every launch; nobody changes a grid
+def grid_of(height: int, width: int, wrap: bool) -> Any:
+    """Returns the `Grid` of an image of H = `height` and W = `width` whose columns wrap around the seam or clamp."""
+    grid = Grid()
+    grid.height, grid.width, grid.wrap = height, width, int(wrap)
+    return grid
 
 
 @wp.func
@@ -53,13 +57,13 @@ def base(coordinate: Any):
 
 
 @wp.func
-def column_of(column: int, grid: Grid):
+def column_of(column: int, width: int, wrap: int):
     """The pixel column that an unbounded column number stands for."""
-    if grid.wrap != 0:
-        if column >= 0 and column < grid.width:
+    if wrap != 0:
+        if column >= 0 and column < width:
             return column  # the usual case, without a division
-        return ((column % grid.width) + grid.width) % grid.width
-    return wp.clamp(column, 0, grid.width - 1)
+        return ((column % width) + width) % width
+    return wp.clamp(column, 0, width - 1)
 
 
 @wp.func
@@ -77,8 +81,8 @@ def bounds(row: Any, column: Any, grid: Grid):
     return (
         wp.max(wp.min(i, grid.height - 1), 0),
         wp.max(wp.min(i + 1, grid.height - 1), 0),
-        wp.max(column_of(j, grid), 0),
-        wp.max(column_of(j + 1, grid), 0),
+        wp.max(column_of(j, grid.width, grid.wrap), 0),
+        wp.max(column_of(j + 1, grid.width, grid.wrap), 0),
     )
 
 
@@ -87,7 +91,7 @@ def neighbour(row: Any, column: Any, t: int, grid: Grid):
     """Pixel (row, column) of neighbour t of a query."""
     return (
         wp.clamp(base(row) + t // 2, 0, grid.height - 1),
-        column_of(base(column) + t % 2, grid),
+        column_of(base(column) + t % 2, grid.width, grid.wrap),
     )
 
 

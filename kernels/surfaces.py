@@ -46,6 +46,7 @@ from kernels.checks import (
     WIDEST_GAP,
     broadcast_batch,
     check_backend,
+    check_devices,
     check_floating,
     check_queries,
 )
@@ -683,7 +684,8 @@ def _rays(
     check_floating("image", image, list(_found), "(..., H, W)")
     if image.ndim < 2 or 0 in image.shape[-2:]:
         raise ValueError(f"image has shape {tuple(image.shape)}; it should be (..., H, W), neither of them 0")
-    check_queries(queries, image, "image")
+    check_queries(queries)
+    check_devices(image=image, queries=queries)
     tables = []
     for name, table, count in (
         ("elevations", elevations, image.shape[-2]),
@@ -692,8 +694,7 @@ def _rays(
         check_floating(name, table, [torch.float32, torch.float64], f"({count},)")
         if table.shape != (count,):
             raise ValueError(f"{name} has shape {tuple(table.shape)}; it should be ({count},), as the image has it")
-        if table.device != image.device:
-            raise ValueError(f"{name} is on {table.device}, image on {image.device}; they should be on one device")
+        check_devices(**{"image": image, name: table})
         tables.append(table.detach().to(image.dtype).contiguous())
     queries = queries.detach().to(image.dtype)
     batch, (image, queries) = broadcast_batch(image=(image.detach(), 2), queries=(queries, 2))
@@ -707,6 +708,5 @@ def _of_queries(
     check_floating(name, tensor, [torch.float32, torch.float64, torch.bfloat16, torch.float16], "of the queries")
     if tensor.shape != (*batch, *shape):
         raise ValueError(f"{name} has shape {tuple(tensor.shape)}; it should be {(*batch, *shape)}")
-    if tensor.device != image.device:
-        raise ValueError(f"{name} is on {tensor.device}, image on {image.device}; they should be on one device")
+    check_devices(**{"image": image, name: tensor})
     return tensor.to(image.dtype).reshape(len(image), *shape).contiguous()

@@ -117,8 +117,8 @@ class Mesh:
             reason = str(error).splitlines()[0]
             raise ValueError(f"device is {device!r}; it should be a device of this machine: {reason}") from None
         initialise()
-        # Rays are cast in float32, which resolves millimetres only up to 10 km from the origin. So the middle of the mesh
-        # becomes the origin.
+        # Rays are cast in float32, which resolves millimetres only up to 10 km from the origin. So the middle of the
+        # mesh becomes the origin.
         self._middle = ((points.amin(0) + points.amax(0)).double() / 2).round().to(self.device)
         self._vertices = (points.to(self.device).double() - self._middle).float()
         self._triangles = faces.to(self.device, torch.int32).contiguous()
