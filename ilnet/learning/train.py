@@ -216,11 +216,11 @@ class _Plan:
     name: str
     size: Preset
     arguments: dict[str, Any]
-    """Of the model."""
+    """Arguments of the model."""
     steps: int
     seed: int
     stored: data.Archive | data.RangeImageTree | None
-    """Where None, it learns from continuous rays."""
+    """Stored images to learn from; None for continuous rays."""
     per_epoch: int
     """Steps in which each stored scan is seen once."""
     target: tuple[int, int]

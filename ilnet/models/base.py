@@ -2,7 +2,7 @@
 
 import itertools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -137,7 +137,8 @@ class Upsampler:
         source: The sensor that measures.
         target: The sensor whose scans are wanted.
         precision: "float32", or "bfloat16" for the layers that are faster in it; the ranges themselves stay float32.
-        device: The device of the scans, and of the model's weights. "cuda" is the current CUDA device.
+        device: The device of the scans and of the model's weights; "cuda" is the current CUDA device. By default it is
+            that of the weights, and the CPU for a model without weights.
 
     Raises:
         ValueError: If the precision is unknown, the model is on another device, or it cannot predict that sensor.
@@ -149,11 +150,11 @@ class Upsampler:
         source: Sensor,
         target: Sensor,
         precision: str = "float32",
-        device: torch.device | str = "cpu",
+        device: torch.device | str | None = None,
     ):
         if precision not in PRECISIONS:
             raise ValueError(f"precision is {precision!r}; it should be one of {', '.join(PRECISIONS)}")
-        self.device = _numbered(device)
+        self.device = _numbered(device or next((weight.device for weight in _weights(model)), "cpu"))
         _check_device(model, self.device)
         model.check_sensors(source, target)
         self.model, self.source, self.target = model, source, target
@@ -237,6 +238,10 @@ class _Recording:
         return answer
 
 
+def _weights(model: Model) -> Iterator[torch.Tensor]:
+    return itertools.chain(model.parameters(), model.buffers())
+
+
 def _numbered(device: torch.device | str) -> torch.device:
     """Returns the device as tensors on it name it: "cuda" is the current CUDA device."""
     return torch.empty(0, device=device).device
@@ -244,7 +249,7 @@ def _numbered(device: torch.device | str) -> torch.device:
 
 def _check_device(model: Model, device: torch.device) -> None:
     """Raises a ValueError unless all weights are on the device; a model without weights is at home anywhere."""
-    for weight in itertools.chain(model.parameters(), model.buffers()):
+    for weight in _weights(model):
         if weight.device != device:
             raise ValueError(
                 f"model is on {weight.device}; it should be on {device}, where the scans are: call model.to('{device}')"

@@ -350,13 +350,14 @@ def test_a_model_elsewhere_than_its_scans_is_refused(yard):
             call(on("meta", scan), target)
     with pytest.raises(ValueError, match=elsewhere):
         models.Upsampler(model, source, target, device="meta")
+    assert models.Upsampler(models.create("planes"), source, target, device="meta").device.type == "meta"
     upsampler = models.Upsampler(model, source, target)
     with pytest.raises(ValueError, match=r"scan is on meta; it should be on cpu, .* call scan.to\('cpu'\)"):
         upsampler(on("meta", scan))
     model.to("meta")
     with pytest.raises(ValueError, match="model is on meta; it should be on cpu"):
         upsampler(scan)
-    assert models.Upsampler(models.create("planes"), source, target, device="meta").device.type == "meta"
+    assert models.Upsampler(model, source, target).device.type == "meta"  # where the model is
 
 
 def test_the_number_of_a_device_counts():
