@@ -155,7 +155,7 @@ def compare(ranges: torch.Tensor, truth: Scan) -> dict[str, float]:
     if ranges.shape != truth.ranges.shape:
         raise ValueError(f"ranges has shape {tuple(ranges.shape)}; it should be {tuple(truth.ranges.shape)}")
     if not ranges.isfinite().all():
-        raise ValueError(f"ranges holds {int((~ranges.isfinite()).sum())} NaN or infinite values")
+        raise ValueError(f"ranges holds {int((~ranges.isfinite()).sum())} NaN or infinite values; all should be finite")
     ranges = ranges.clamp(0, truth.sensor.norm_range)
     error, at_edge = (ranges - truth.filled()).abs(), edges(truth)
     predicted, true = _occupied(ranges, truth), _occupied(truth.filled(), truth)

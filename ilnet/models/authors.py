@@ -65,9 +65,11 @@ def read(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.Tensor]]:
     try:
         checkpoint = torch.load(path, weights_only=True, map_location="cpu")
     except pickle.UnpicklingError as error:
-        raise ValueError(f"{path}: holds more than tensors and plain values, or is damaged; nothing was run") from error
+        raise ValueError(
+            f"{path}: holds more than tensors and plain values, or is damaged; nothing in it was run"
+        ) from error
     except (RuntimeError, EOFError, zipfile.BadZipFile, ValueError, LookupError) as error:
-        raise ValueError(f"{path}: not a whole checkpoint") from error
+        raise ValueError(f"{path}: it is not a whole checkpoint") from error
     try:
         content = dict(checkpoint)
         model, norm_range = content["model"], float(content["lidar_in"]["norm_r"])

@@ -178,7 +178,7 @@ class Upsampler:
             ValueError: If the scan is not one of the source sensor, or the scan or the model is on another device.
         """
         if scan.sensor != self.source:
-            raise ValueError(f"scan is of {scan.sensor!r}; it should be of {self.source!r}, as this upsampler is")
+            raise ValueError(f"scan is of {scan.sensor!r}; it should be of {self.source!r}, as this upsampler expects")
         if scan.ranges.device != self.device:
             raise ValueError(
                 f"scan is on {scan.ranges.device}; it should be on {self.device}, the device of this upsampler: "

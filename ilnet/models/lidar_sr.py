@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from ilnet.models.base import Model
-from ilnet.sensor import Sensor
+from ilnet.sensor import Sensor, format_size
 
 __all__ = ["LiDARSR"]
 
@@ -60,7 +60,7 @@ class LiDARSR(Model):
             if times < 1 or times & (times - 1):
                 raise ValueError(f"{name} is {times}; it should be a power of two")
         if rows == columns == 1:
-            raise ValueError("rows and columns are both 1: there is nothing to predict")
+            raise ValueError("rows and columns are 1; one of them should be more: there is nothing to predict")
         super().__init__()
         self.rows, self.columns, self.norm_range = rows, columns, norm_range
         doublings = range(max(rows, columns).bit_length() - 1)
@@ -83,9 +83,9 @@ class LiDARSR(Model):
             ValueError: If `target` has another size than the network predicts from `source`, or looks elsewhere.
         """
         size = source.shape[0] * self.rows, source.shape[1] * self.columns
-        what = f"lidar-sr at {self.rows}x{self.columns} makes {size[0]}x{size[1]} rays of this scan"
+        what = f"lidar-sr at {self.rows}x{self.columns} makes {format_size(size)} rays of this scan"
         if target.shape != size:
-            raise ValueError(f"{what}, not {target.shape[0]}x{target.shape[1]}: a network has one target size")
+            raise ValueError(f"{what}, not {target.size}: a network has one target size")
         if any(count % (1 << _HALVINGS) for count in size):
             raise ValueError(f"{what}, but both numbers should be multiples of {1 << _HALVINGS}")
         away = (source.grid_queries(target) - source.grid_queries(source.resize(*size))).abs()
