@@ -124,7 +124,7 @@ def test_the_notebook_shows_no_error_warning_or_local_path(source):
     assert [output for output in shown if output.output_type == "error"] == []
     assert [output.text for output in shown if output.get("name") == "stderr"] == []
     for output in shown:
-        output.get("data", {}).pop("image/png", None)  # base64 spells whatever it likes
+        output.get("data", {}).pop("image/png", None)  # base64 may spell anything
     assert LOCAL_PATH.findall(nbformat.writes(notebook)) == []
 
 
