@@ -11,7 +11,7 @@ tokens stay in the cache of its core, and only ranges are written. γ and β of 
 behind them; what adds the same to the scores of all 4 neighbours, such as the bias of the head, does not change them.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
@@ -20,9 +20,9 @@ from kernels import reference
 from kernels.checks import PRIORS, RANGE_FLOOR, check_backend, check_devices, check_queries
 from kernels.lanes import LANES, add_products, gelu, rsqrt, total, vectors
 from kernels.launch import launch
-from kernels.neighbour_attention.maths import attend, stencil
-from kernels.neighbour_attention.table import Projected, head_last
-from kernels.neighbour_attention.vectors import HEADS, arguments, fits
+from kernels.neighbour_attention.maths import PIXEL_TABLES, attend, stencil
+from kernels.neighbour_attention.table import Projected, fields, head_last
+from kernels.neighbour_attention.vectors import HEADS, fits
 from kernels.stencil import area
 from kernels.vmap import refuse
 
@@ -31,13 +31,14 @@ __all__ = ["DecoderWeights", "fused_decode", "fused_decode_serves"]
 # Threads that share the queries, and how many queries each takes at a time: their tokens fit the cache of a core, and a
 # layer's weights are read from its fastest part for all of them.
 _WORKERS = 64
-_GROUP = 16
+_GROUP = wp.constant(16)
 
 _BILINEAR = wp.constant(PRIORS.index("bilinear"))
 _PERSPECTIVE = wp.constant(PRIORS.index("perspective"))
 _RANGE_FLOOR = wp.constant(RANGE_FLOOR)
 
 _lanes = vectors(LANES, wp.float32)
+_pixel_table: Any = PIXEL_TABLES[_lanes]
 
 
 @wp.func
@@ -78,89 +79,96 @@ def _blend(scores: wp.vec4, ranges: wp.vec4, row: float, column: float, prior: i
     return wp.dot(factor, ranges) / (factor[0] + factor[1] + factor[2] + factor[3])
 
 
+@wp.struct
+class _Scratch:
+    """Memory of the threads: rows 4·_GROUP·i and the following belong to thread i."""
+
+    tokens: wp.array2d[_lanes]
+    """(4·_GROUP·threads, blocks): t."""
+    x: wp.array2d[_lanes]
+    """(4·_GROUP·threads, blocks): what a layer reads."""
+    x_scalars: wp.array2d[float]
+    """(4·_GROUP·threads, C): the same memory, number by number."""
+    h: wp.array2d[_lanes]
+    """(4·_GROUP·threads, blocks): the hidden layer."""
+    h_scalars: wp.array2d[float]
+    """(4·_GROUP·threads, C): the same memory, number by number."""
+
+
+@wp.struct
+class _Blend:
+    """What scores become ranges with."""
+
+    image: wp.array[float]
+    """(B·H·W,): r, metres."""
+    added: wp.array2d[float]
+    """(B·Q, 4) to add to the scores, or none."""
+    prior: int
+    """Number of the prior in `PRIORS`."""
+    area_floor: float
+    """Least bilinear area in the prior."""
+
+
 @wp.kernel(enable_backward=False)
 def _fused_decode_kernel(
     first: int,
     # in
-    pixels: wp.array2d[_lanes],
-    moments: wp.array2d[float],
+    table: _pixel_table,
     queries: wp.array2d[float],
-    slope: wp.array2d[_lanes],
-    shift: wp.array[_lanes],
-    gram: wp.array2d[float],
-    height: int,
-    width: int,
-    per_image: int,
-    heads: int,
-    four: int,
-    eps: float,
-    wrap: int,
-    image: wp.array[float],
     weights: wp.array3d[_lanes],
     biases: wp.array2d[_lanes],
-    prior: int,
-    area_floor: float,
-    added: wp.array2d[float],
+    blend: _Blend,
     share: int,
-    group: int,
-    x_scalars: wp.array2d[float],
-    h_scalars: wp.array2d[float],
     # out
-    tokens_out: wp.array2d[_lanes],
-    x_out: wp.array2d[_lanes],
-    h_out: wp.array2d[_lanes],
+    scratch_out: _Scratch,
     blended_out: wp.array[float],
 ):
     worker = first + wp.tid()
+    tokens = scratch_out.tokens
+    x = scratch_out.x
+    h = scratch_out.h
     blocks = biases.shape[1]
-    row = worker * 4 * group
+    row = worker * 4 * _GROUP
     last = wp.min((worker + 1) * share, queries.shape[0])
-    for begin in range(worker * share, last, group):
-        end = wp.min(begin + group, last)
+    for begin in range(worker * share, last, _GROUP):
+        end = wp.min(begin + _GROUP, last)
         stop = row + 4 * (end - begin)
         for n in range(begin, end):
-            pixel, down, right, inverse = stencil(
-                moments, queries, n, n // per_image, height, width, gram, LANES * blocks, eps, wrap
-            )
-            attend(
-                pixels, slope, shift, pixel, down, right, inverse, heads, 1, 0, four, row + 4 * (n - begin),
-                tokens_out, x_out,
-            )  # fmt: skip
+            around = stencil(table, queries, n)
+            attend(table, around, 0, row + 4 * (n - begin), tokens, x)
         for i in range(row, stop):
             for c in range(blocks):
-                tokens_out[i, c] = tokens_out[i, c] + biases[0, c]
+                tokens[i, c] = tokens[i, c] + biases[0, c]
         for i in range(row, stop, 4):
-            add_products(x_scalars, weights[0], i, tokens_out)
+            add_products(scratch_out.x_scalars, weights[0], i, tokens)
         for i in range(row, stop):
-            _normalise(tokens_out, i, eps, x_out)
+            _normalise(tokens, i, table.eps, x)
             for c in range(blocks):
-                h_out[i, c] = biases[1, c]
+                h[i, c] = biases[1, c]
         for i in range(row, stop, 4):
-            add_products(x_scalars, weights[1], i, h_out)
+            add_products(scratch_out.x_scalars, weights[1], i, h)
         for i in range(row, stop):
             for c in range(blocks):
-                h_out[i, c] = gelu(h_out[i, c])
-                tokens_out[i, c] = tokens_out[i, c] + biases[2, c]
+                h[i, c] = gelu(h[i, c])
+                tokens[i, c] = tokens[i, c] + biases[2, c]
         for i in range(row, stop, 4):
-            add_products(h_scalars, weights[2], i, tokens_out)
+            add_products(scratch_out.h_scalars, weights[2], i, tokens)
         for n in range(begin, end):
-            pixel, down, right, inverse = stencil(
-                moments, queries, n, n // per_image, height, width, gram, LANES * blocks, eps, wrap
-            )
+            around = stencil(table, queries, n)
             scores = wp.vec4()
             ranges = wp.vec4()
             for t in range(4):
                 i = row + 4 * (n - begin) + t
-                _normalise(tokens_out, i, eps, x_out)
+                _normalise(tokens, i, table.eps, x)
                 score = _lanes()
                 for c in range(blocks):
-                    score += wp.cw_mul(x_out[i, c], biases[3, c])
+                    score += wp.cw_mul(x[i, c], biases[3, c])
                 scores[t] = total(score)[0]
-                ranges[t] = image[pixel[t]]
-            if added.shape[0] > 0:
+                ranges[t] = blend.image[around.pixel[t]]
+            if blend.added.shape[0] > 0:
                 for t in range(4):
-                    scores[t] = scores[t] + added[n, t]
-            blended_out[n] = _blend(scores, ranges, queries[n, 0], queries[n, 1], prior, area_floor)
+                    scores[t] = scores[t] + blend.added[n, t]
+            blended_out[n] = _blend(scores, ranges, queries[n, 0], queries[n, 1], blend.prior, blend.area_floor)
 
 
 class DecoderWeights(NamedTuple):
@@ -206,9 +214,11 @@ def _fused_decode(
     blended = pixels.new_empty(batch, count)
     tokens, x, h = pixels.new_empty(3, 4 * _GROUP * _WORKERS, channels)
     share = -(-batch * count // _WORKERS)
-    first = arguments(pixels, queries, slope, shift, gram, HEADS, eps, wrap)
-    others = [image.reshape(-1), weights, biases, prior, area_floor, added.view(-1, 4), share, _GROUP, x, h]
-    launch(_fused_decode_kernel, _WORKERS, [*first, *others], [tokens, x, h, blended.view(-1)], least=1)
+    table = fields(pixels, slope, shift, gram, HEADS, eps, wrap, per_image=count, groups=1)
+    blend = {"image": image.view(-1), "added": added.view(-1, 4), "prior": prior, "area_floor": area_floor}
+    scratch = {"tokens": tokens, "x": x, "x_scalars": x, "h": h, "h_scalars": h}
+    inputs = [table, queries.view(-1, 2), weights, biases, blend, share]
+    launch(_fused_decode_kernel, _WORKERS, inputs, [scratch, blended.view(-1)], least=1)
     return blended
 
 

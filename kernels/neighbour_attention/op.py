@@ -12,8 +12,8 @@ from kernels import reference
 from kernels.checks import check_backend, check_devices, check_floating, check_queries
 from kernels.launch import launch
 from kernels.neighbour_attention import vectors
-from kernels.neighbour_attention.heads import _attend, _attend_backward
-from kernels.neighbour_attention.table import Projected, head_last
+from kernels.neighbour_attention.heads import ATTEND, ATTEND_BACKWARD
+from kernels.neighbour_attention.table import Projected, fields, head_last
 from kernels.scatter import adjoint_of_gather
 from kernels.vmap import refuse
 
@@ -40,8 +40,8 @@ def _neighbour_attention(
     batch, count, _ = queries.shape
     tokens = pixels.new_empty(batch * count * 4, channels)
     attended = torch.empty_like(tokens)
-    inputs = vectors.arguments(pixels, queries, slope, shift, gram, heads, eps, wrap)
-    launch(_attend[pixels.dtype], batch * count * heads, inputs, [tokens, attended])
+    table = fields(pixels, slope, shift, gram, heads, eps, wrap, per_image=count, groups=heads)
+    launch(ATTEND[pixels.dtype], batch * count * heads, [table, queries.view(-1, 2)], [tokens, attended])
     with torch.autocast(pixels.device.type, enabled=False):
         step = tokens.add_(bias).to(dtype).addmm_(attended.to(dtype), weight.to(dtype).T)
     return step.view(batch, count, 4, channels)
@@ -88,16 +88,10 @@ def _neighbour_attention_backward(
         attended = torch.empty_like(adj_tokens)
         adj_squares = pixels.new_empty(len(adj_tokens), heads)
         coefficients = pixels.new_empty(len(adj_tokens), 3)
-        launch(
-            _attend_backward[pixels.dtype],
-            batch * count * heads,
-            [
-                *vectors.arguments(pixels, queries, slope, shift, gram, heads, eps, wrap),
-                adj_tokens,
-                adj_attended,
-            ],
-            [adj_rows, attended, adj_squares, coefficients],
-        )
+        table = fields(pixels, slope, shift, gram, heads, eps, wrap, per_image=count, groups=heads)
+        inputs = [table, queries.view(-1, 2), adj_tokens, adj_attended]
+        outputs = [adj_rows, attended, adj_squares, coefficients]
+        launch(ATTEND_BACKWARD[pixels.dtype], batch * count * heads, inputs, outputs)
         adj_squares, offsets = adj_squares.sum(1, keepdim=True), coefficients[:, :2]
         adj_rows[:, 4 * channels : 4 * channels + 3] = torch.cat((adj_squares, 2 * offsets * adj_squares), 1)
         adj_affine = coefficients.T @ adj_rows[:, : 4 * channels]

@@ -1,13 +1,14 @@
 """The table of projected pixels that the attention step reads."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 
-from kernels.neighbour_attention.maths import MOMENTS
+from kernels.neighbour_attention.maths import MOMENTS, ROLLED_FOUR
+from kernels.stencil import grid_of
 
-__all__ = ["Projected", "head_last", "project_pixels"]
+__all__ = ["Projected", "fields", "head_last", "project_pixels"]
 
 
 class Projected(NamedTuple):
@@ -79,3 +80,34 @@ def project_pixels(
         pixels = torch.cat((x, mean, (x * x).sum(-1, keepdim=True)), -1) @ rows
         slope = torch.cat((projection @ centred, position[0])).T.contiguous()
         return Projected(pixels, slope, qkv_weight @ norm[1], centred.T @ centred, heads)
+
+
+def fields(
+    pixels: torch.Tensor,
+    slope: torch.Tensor,
+    shift: torch.Tensor,
+    gram: torch.Tensor,
+    heads: int,
+    eps: float,
+    wrap: bool,
+    *,
+    per_image: int,
+    groups: int,
+) -> dict[str, Any]:
+    """The fields of a `PixelTable` (`kernels.neighbour_attention.maths`), for `launch`."""
+    _, height, width, columns = pixels.shape
+    rows = pixels.view(-1, columns)
+    return {
+        "pixels": rows,
+        "moments": rows[:, columns - MOMENTS : columns - MOMENTS + 3],
+        "slope": slope,
+        "shift": shift,
+        "gram": gram,
+        "channels": len(shift) // 3,
+        "heads": heads,
+        "groups": groups,
+        "eps": eps,
+        "grid": grid_of(height, width, wrap),
+        "per_image": per_image,
+        "rolled_four": ROLLED_FOUR,
+    }

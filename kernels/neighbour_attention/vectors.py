@@ -12,11 +12,12 @@ import torch
 import warp as wp
 
 from kernels.lanes import LANES, add_outer, add_products, vectors
-from kernels.launch import launch
-from kernels.neighbour_attention.maths import MOMENTS, adj_squares, attend, attend_backward, stencil
+from kernels.launch import concrete, launch
+from kernels.neighbour_attention.maths import PIXEL_TABLES, adj_squares, attend, attend_backward, stencil
+from kernels.neighbour_attention.table import fields
 from kernels.scatter import sort_queries
 
-__all__ = ["HEADS", "arguments", "fits", "step", "step_backward"]
+__all__ = ["HEADS", "fits", "step", "step_backward"]
 
 # Threads that share the queries of a forward pass. Each has a few rows of memory to itself.
 _WORKERS = 64
@@ -25,139 +26,144 @@ _WORKERS = 64
 HEADS = LANES // 2
 
 _lanes = vectors(LANES, wp.float32)
+_pixel_table: Any = PIXEL_TABLES[_lanes]
+
+
+@wp.struct
+class _Scratch:
+    """Memory of the threads of the forward pass: rows 4 i to 4 i + 3 belong to thread i."""
+
+    tokens: wp.array2d[_lanes]
+    """(4·threads, blocks): t."""
+    attended: wp.array2d[_lanes]
+    """(4·threads, blocks): what the heads attended to."""
+    attended_scalars: wp.array2d[float]
+    """(4·threads, C): the same memory, number by number."""
+
+
+@wp.struct
+class _BackwardScratch:
+    """Memory of the threads of the backward pass: rows 4 i to 4 i + 3 belong to thread i."""
+
+    adj_tokens: wp.array2d[_lanes]
+    """(4·threads, blocks): gradient of t, which is that of the step."""
+    adj_tokens_scalars: wp.array2d[float]
+    """(4·threads, C): the same memory, number by number."""
+    adj_attended: wp.array2d[_lanes]
+    """(4·threads, blocks): gradient of what the heads attended to."""
+    attended: wp.array2d[_lanes]
+    """(4·threads, blocks): what the heads attended to."""
+    adj_rows: wp.array2d[_lanes]
+    """(4·threads, 4·blocks): gradients of A + B q and of z + Wq + b."""
+
+
+@wp.struct
+class _Gradients:
+    """What the backward pass adds up: of the pixels in place, of the parameters for each thread."""
+
+    pixels: wp.array2d[_lanes]
+    """(B·H·W, 4·blocks and padding): of `PixelTable.pixels`."""
+    moments: wp.array2d[float]
+    """(B·H·W, 3): of `PixelTable.moments`; the same memory."""
+    affine: wp.array2d[_lanes]
+    """(3·threads, 4·blocks): of the two rows of `PixelTable.slope`, and of `PixelTable.shift`."""
+    gram: wp.array2d[float]
+    """(threads, 3): of N₁₁, N₁₂ and N₂₂."""
+    weight: wp.array2d[_lanes]
+    """(C·threads, blocks): of O."""
+    bias: wp.array2d[_lanes]
+    """(threads, blocks): of the bias of O."""
 
 
 @wp.kernel(enable_backward=False)
 def _step_kernel(
     first: int,
     # in
-    pixels: wp.array2d[_lanes],
-    moments: wp.array2d[float],
+    table: _pixel_table,
     queries: wp.array2d[float],
-    slope: wp.array2d[_lanes],
-    shift: wp.array[_lanes],
-    gram: wp.array2d[float],
-    height: int,
-    width: int,
-    per_image: int,
-    heads: int,
-    four: int,
-    eps: float,
-    wrap: int,
     weight: wp.array2d[_lanes],
     bias: wp.array[_lanes],
-    attended_scalars: wp.array2d[float],
     share: int,
     # out
-    tokens_out: wp.array2d[_lanes],
-    attended_out: wp.array2d[_lanes],
+    scratch_out: _Scratch,
     step_out: wp.array2d[Any],
 ):
-    worker = first + wp.tid()
-    row = 4 * worker
+    thread = first + wp.tid()
+    row = 4 * thread
+    tokens = scratch_out.tokens
     blocks = bias.shape[0]
-    for n in range(worker * share, wp.min((worker + 1) * share, queries.shape[0])):
-        pixel, down, right, inverse = stencil(
-            moments, queries, n, n // per_image, height, width, gram, 16 * blocks, eps, wrap
-        )
-        attend(
-            pixels, slope, shift, pixel, down, right, inverse, heads, 1, 0, four, row, tokens_out, attended_out
-        )  # fmt: skip
+    for n in range(thread * share, wp.min((thread + 1) * share, queries.shape[0])):
+        around = stencil(table, queries, n)
+        attend(table, around, 0, row, tokens, scratch_out.attended)
         for c in range(blocks):
             for t in range(4):
-                tokens_out[row + t, c] = tokens_out[row + t, c] + bias[c]
-        add_products(attended_scalars, weight, row, tokens_out)
+                tokens[row + t, c] = tokens[row + t, c] + bias[c]
+        add_products(scratch_out.attended_scalars, weight, row, tokens)
         for c in range(blocks):
             for t in range(4):
-                step_out[4 * n + t, c] = step_out.dtype(tokens_out[row + t, c])
+                step_out[4 * n + t, c] = step_out.dtype(tokens[row + t, c])
 
 
 @wp.kernel(enable_backward=False)
 def _step_backward_kernel(
     first: int,
     # in
-    pixels: wp.array2d[_lanes],
-    moments: wp.array2d[float],
+    table: _pixel_table,
     queries: wp.array2d[float],
-    slope: wp.array2d[_lanes],
-    shift: wp.array[_lanes],
-    gram: wp.array2d[float],
-    height: int,
-    width: int,
-    per_image: int,
-    heads: int,
-    four: int,
-    eps: float,
-    wrap: int,
     weight: wp.array2d[_lanes],
     adj_step: wp.array2d[Any],
-    adj_scalars: wp.array2d[float],
     order: wp.array[wp.int32],
     starts: wp.array[wp.int32],
     parity: int,
     # out
-    adj_rows_out: wp.array2d[_lanes],
-    adj_attended_out: wp.array2d[_lanes],
-    attended_out: wp.array2d[_lanes],
-    rows_out: wp.array2d[_lanes],
-    adj_pixels_out: wp.array2d[_lanes],
-    adj_moments_out: wp.array2d[float],
-    adj_affine_out: wp.array2d[_lanes],
-    adj_gram_out: wp.array2d[float],
-    adj_weight_out: wp.array2d[_lanes],
-    adj_bias_out: wp.array2d[_lanes],
+    scratch_out: _BackwardScratch,
+    gradients_out: _Gradients,
 ):
-    band = 2 * (first + wp.tid()) + parity
+    thread = first + wp.tid()
+    band = 2 * thread + parity
     row = 4 * band
     blocks = weight.shape[1]
-    for s in range(starts[band * (width + 1)], starts[(band + 1) * (width + 1)]):
+    scratch = scratch_out
+    of = gradients_out
+    for s in range(starts[band * (table.grid.width + 1)], starts[(band + 1) * (table.grid.width + 1)]):
         n = order[s]
-        for t in range(four):
+        for t in range(table.rolled_four):
             for c in range(blocks):
-                gradient = adj_rows_out.dtype(adj_step[4 * n + t, c])
-                adj_rows_out[row + t, c] = gradient
-                adj_bias_out[band, c] = adj_bias_out[band, c] + gradient
-                adj_attended_out[row + t, c] = _lanes()
-        add_products(adj_scalars, weight, row, adj_attended_out)
-        pixel, down, right, inverse = stencil(
-            moments, queries, n, n // per_image, height, width, gram, 16 * blocks, eps, wrap
-        )
+                gradient = _lanes(adj_step[4 * n + t, c])
+                scratch.adj_tokens[row + t, c] = gradient
+                of.bias[band, c] = of.bias[band, c] + gradient
+                scratch.adj_attended[row + t, c] = _lanes()
+        add_products(scratch.adj_tokens_scalars, weight, row, scratch.adj_attended)
+        around = stencil(table, queries, n)
         adj_inverse = attend_backward(
-            pixels, slope, shift, pixel, down, right, inverse, heads, 1, 0, four,
-            adj_rows_out, adj_attended_out, row, rows_out, attended_out,
-        )  # fmt: skip
-        add_outer(adj_scalars, attended_out, row, 16 * blocks * band, adj_weight_out)
-        for t in range(four):
-            squares = adj_squares(adj_inverse[t], inverse[t], 16 * blocks)
-            p = pixel[t]
-            adj_moments_out[p, 0] = adj_moments_out[p, 0] + squares
-            squares_down = squares * down[t]
-            squares_right = squares * right[t]
-            adj_moments_out[p, 1] = adj_moments_out[p, 1] + squares_down + squares_down
-            adj_moments_out[p, 2] = adj_moments_out[p, 2] + squares_right + squares_right
-            adj_gram_out[band, 0] = adj_gram_out[band, 0] + squares_down * down[t]
-            adj_gram_out[band, 1] = adj_gram_out[band, 1] + squares_down * right[t]
-            adj_gram_out[band, 2] = adj_gram_out[band, 2] + squares_right * right[t]
-            deviation = 1.0 / inverse[t]
+            table, around, 0, row, scratch.adj_tokens, scratch.adj_attended, scratch.adj_rows, scratch.attended
+        )
+        add_outer(scratch.adj_tokens_scalars, scratch.attended, row, table.channels * band, of.weight)
+        for t in range(table.rolled_four):
+            squares = adj_squares(table, around, t, adj_inverse[t])
+            p = around.pixel[t]
+            down = around.down[t]
+            right = around.right[t]
+            of.moments[p, 0] = of.moments[p, 0] + squares
+            of.moments[p, 1] = of.moments[p, 1] + 2.0 * squares * down
+            of.moments[p, 2] = of.moments[p, 2] + 2.0 * squares * right
+            of.gram[band, 0] = of.gram[band, 0] + squares * down * down
+            of.gram[band, 1] = of.gram[band, 1] + squares * down * right
+            of.gram[band, 2] = of.gram[band, 2] + squares * right * right
+            deviation = 1.0 / around.inverse[t]
             for c in range(4 * blocks):
-                x = rows_out[row + t, c]
-                adj_pixels_out[p, c] = adj_pixels_out[p, c] + x
-                adj_affine_out[3 * band, c] = adj_affine_out[3 * band, c] + x * down[t]
-                adj_affine_out[3 * band + 1, c] = adj_affine_out[3 * band + 1, c] + x * right[t]
-                adj_affine_out[3 * band + 2, c] = adj_affine_out[3 * band + 2, c] + x * deviation
-
-
-def _concrete(kernel: wp.Kernel, stored: type) -> wp.Kernel:
-    types = []
-    for argument in kernel.adj.args:
-        generic = getattr(argument.type, "dtype", None) is Any
-        types.append(wp.array2d(dtype=wp.types.vector(LANES, stored)) if generic else argument.type)
-    return wp.overload(kernel, types)
+                x = scratch.adj_rows[row + t, c]
+                of.pixels[p, c] = of.pixels[p, c] + x
+                of.affine[3 * band, c] = of.affine[3 * band, c] + x * down
+                of.affine[3 * band + 1, c] = of.affine[3 * band + 1, c] + x * right
+                of.affine[3 * band + 2, c] = of.affine[3 * band + 2, c] + x * deviation
 
 
 _STORED = {torch.float32: wp.float32, torch.bfloat16: wp.bfloat16}
-_step = {dtype: _concrete(_step_kernel, stored) for dtype, stored in _STORED.items()}
-_step_backward = {dtype: _concrete(_step_backward_kernel, stored) for dtype, stored in _STORED.items()}
+_step, _step_backward = (
+    {dtype: concrete(kernel, {Any: wp.types.vector(LANES, stored)}) for dtype, stored in _STORED.items()}
+    for kernel in (_step_kernel, _step_backward_kernel)
+)
 
 
 def fits(pixels: torch.Tensor, dtype: torch.dtype, channels: int, heads: int) -> bool:
@@ -186,41 +192,14 @@ def step(
 ) -> torch.Tensor:
     """(B, Q, 4, C) tokens after the step; the arguments are those of the op `neighbour_attention`."""
     batch, count, channels = len(pixels), queries.shape[1], len(bias)
-    tokens = pixels.new_empty(batch, count, 4, channels, dtype=dtype)
-    scratch = pixels.new_empty(2, 4 * _WORKERS, channels)
+    step = pixels.new_empty(batch, count, 4, channels, dtype=dtype)
+    tokens, attended = pixels.new_empty(2, 4 * _WORKERS, channels)
+    table = fields(pixels, slope, shift, gram, heads, eps, wrap, per_image=count, groups=1)
     share = -(-batch * count // _WORKERS)
-    launch(
-        _step[dtype],
-        _WORKERS,
-        [
-            *arguments(pixels, queries, slope, shift, gram, heads, eps, wrap),
-            weight.T.contiguous(),
-            bias,
-            scratch[1],
-            share,
-        ],
-        [scratch[0], scratch[1], tokens.view(-1, channels)],
-        least=1,
-    )
-    return tokens
-
-
-def arguments(
-    pixels: torch.Tensor,
-    queries: torch.Tensor,
-    slope: torch.Tensor,
-    shift: torch.Tensor,
-    gram: torch.Tensor,
-    heads: int,
-    eps: float,
-    wrap: bool,
-) -> list:
-    """What all kernels of the step take first."""
-    _, height, width, columns = pixels.shape
-    table = pixels.reshape(-1, columns)
-    moments = table[:, columns - MOMENTS : columns - MOMENTS + 3]
-    sizes = [height, width, queries.shape[1], heads, 4]
-    return [table, moments, queries.reshape(-1, 2), slope, shift, gram, *sizes, eps, int(wrap)]
+    scratch = {"tokens": tokens, "attended": attended, "attended_scalars": attended}
+    inputs = [table, queries.view(-1, 2), weight.T.contiguous(), bias, share]
+    launch(_step[dtype], _WORKERS, inputs, [scratch, step.view(-1, channels)], least=1)
+    return step
 
 
 def step_backward(
@@ -237,36 +216,38 @@ def step_backward(
 ) -> tuple[torch.Tensor, ...]:
     """Gradients of pixels, slope, shift, gram, weight and bias; the arguments are those of the op's backward."""
     batch, height, width, columns = pixels.shape
-    channels = len(weight)
+    count, channels = queries.shape[1], len(weight)
     order, starts = sort_queries(queries, height, width, wrap)
     bands = batch * (height + 1)
     scratch = pixels.new_empty(7, 4 * bands, channels)
     adj_pixels = torch.zeros_like(pixels)
-    adj_table = adj_pixels.view(-1, columns)
     adj_affine = pixels.new_zeros(bands, 3, 4 * channels)
     adj_gram = pixels.new_zeros(bands, 3)
     adj_weight = pixels.new_zeros(bands, channels, channels)
     adj_bias = pixels.new_zeros(bands, channels)
+    adj_table = adj_pixels.view(-1, columns)
+    inputs = [
+        fields(pixels, slope, shift, gram, heads, eps, wrap, per_image=count, groups=1),
+        *(queries.view(-1, 2), weight, adj_step.reshape(-1, channels).contiguous(), order, starts),
+    ]
+    rows = {
+        "adj_tokens": scratch[0],
+        "adj_tokens_scalars": scratch[0],
+        "adj_attended": scratch[1],
+        "attended": scratch[2],
+        "adj_rows": scratch[3:].view(-1, 4 * channels),
+    }
+    gradients = {
+        "pixels": adj_table,
+        "moments": adj_table[:, 4 * channels : 4 * channels + 3],
+        "affine": adj_affine.view(-1, 4 * channels),
+        "gram": adj_gram,
+        "weight": adj_weight.view(-1, channels),
+        "bias": adj_bias,
+    }
     for parity in range(2):  # bands next to each other share a row of pixels
-        launch(
-            _step_backward[adj_step.dtype],
-            (bands + 1 - parity) // 2,
-            [
-                *arguments(pixels, queries, slope, shift, gram, heads, eps, wrap),
-                *(weight, adj_step.reshape(-1, channels).contiguous(), scratch[0], order, starts, parity),
-            ],
-            [
-                *(scratch[0], scratch[1], scratch[2], scratch[3:].view(-1, 4 * channels)),
-                *(
-                    adj_table,
-                    adj_table[:, 4 * channels : 4 * channels + 3],
-                    adj_affine.view(-1, 4 * channels),
-                    adj_gram,
-                ),
-                *(adj_weight.view(-1, channels), adj_bias),
-            ],
-            least=1,
-        )
+        threads = (bands + 1 - parity) // 2
+        launch(_step_backward[adj_step.dtype], threads, [*inputs, parity], [rows, gradients], least=1)
     affine, (down, both, right) = adj_affine.sum(0), adj_gram.sum(0)
     gram = torch.stack((down, both, both, right)).view(2, 2)
     return adj_pixels, affine[:2].clone(), affine[2, : 3 * channels].clone(), gram, adj_weight.sum(0), adj_bias.sum(0)
