@@ -106,7 +106,8 @@ def _wait() -> None:
 
 def _compiled(work: Callable[..., torch.Tensor], device: torch.device) -> Callable[..., torch.Tensor] | None:
     """Returns `torch.compile` of a function; None if its default backend finds no compiler."""
-    if device.type == "cpu" and not (shutil.which("g++") or shutil.which("clang++")):
+    compilers = ("g++", "clang++") if device.type == "cpu" else ("cc", "gcc", "clang")
+    if not any(map(shutil.which, compilers)):
         return None
     return torch.compile(work, fullgraph=True)
 

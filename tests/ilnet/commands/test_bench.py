@@ -6,6 +6,7 @@ import sys
 import pytest
 import torch
 from click.testing import CliRunner
+from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensorMode
 
 from ilnet import models
 from ilnet.commands import bench
@@ -56,6 +57,20 @@ def test_a_row_holds_medians_and_the_largest_difference():
     text = bench.table([row])
     assert "something slower" in text
     assert f"{row.ratio:.1f}x" in text
+
+
+def test_results_on_two_devices_are_compared_on_the_cpu():
+    """Other ray casters answer on the CPU."""
+    with FakeTensorMode():  # as if there were a GPU
+        ours, other = torch.ones(3, device="cuda"), torch.ones(3)
+        row = bench._compare("it", "3 numbers", lambda: [ours], {"another library": lambda: [other]})
+        with pytest.raises(DataDependentOutputException):  # the difference was taken; a fake one has no value
+            next(row)
+
+
+def test_without_a_compiler_nothing_is_compiled(monkeypatch):
+    monkeypatch.setattr(bench.shutil, "which", lambda name: None)
+    assert all(bench._compiled(torch.sin, torch.device(kind)) is None for kind in ("cpu", "cuda"))
 
 
 def test_the_authors_formulation_is_the_same_network():

@@ -1,7 +1,9 @@
 import csv
 import math
+import types
 
 import pytest
+import torch
 
 from ilnet import data, models
 from ilnet.commands import experiment
@@ -186,3 +188,23 @@ def test_two_measured_files_of_one_name_are_refused_before_any_training(tmp_path
     code, out, [error] = command("experiment", "convergence", "real", "--measured", files[0], "--measured", files[1])
     assert (code, out) == (2, "")
     assert "their names should differ" in error
+
+
+def test_networks_go_where_the_scans_are(tmp_path, monkeypatch):
+    """Scans of towns are on a GPU where there is one; a device without numbers stands in for it."""
+    scan = types.SimpleNamespace(ranges=torch.empty(0, device="meta"), sensor=preset("paper-16x1024"))
+    model, seen = models.create("iln", features=16, blocks=1, heads=4), []
+
+    def devices(*_, **options):
+        seen.append((model.head[1].weight.device.type, str(options.get("device", "meta"))))
+        return types.SimpleNamespace(ranges=lambda scan: torch.zeros(1))
+
+    monkeypatch.setattr(evaluate, "town_pairs", lambda *_: [(scan, scan)])
+    monkeypatch.setattr(models, "Upsampler", devices)
+    monkeypatch.setattr(models, "load", lambda file: model)
+    monkeypatch.setattr(model, "upsample", devices)
+    monkeypatch.setattr(experiment.plot, "point_clouds", lambda *_, **options: None)
+    experiment._frame_time(model)
+    model.to_empty(device="cpu")
+    experiment._draw_points(experiment.Study(None, tmp_path), (64, 1024), {"iln": "iln"})
+    assert set(seen) == {("meta", "meta")}
