@@ -51,7 +51,7 @@ from kernels.checks import (
     check_queries,
 )
 from kernels.lanes import exp2
-from kernels.launch import launch, overload
+from kernels.launch import launch
 from kernels.stencil import area, base, column_of, query_of
 from kernels.vmap import refuse
 
@@ -65,9 +65,6 @@ _LEAST_SCALE = wp.constant(LEAST_SCALE)
 _TOLERANCE = wp.constant(TOLERANCE)
 _WIDEST_GAP = wp.constant(WIDEST_GAP)
 _TURN = wp.constant(6.283185307179586)
-
-_many = wp.types.vector(4 * KINDS, wp.Float)
-_four = wp.types.vector(4, wp.Float)
 
 
 @wp.func
@@ -138,16 +135,7 @@ def _change(u: Any, other: Any, a: Any, b: Any):
 
 
 @wp.func
-def _hypotheses(
-    image: wp.array3d[Any],
-    b: int,
-    row: Any,
-    column: Any,
-    elevations: wp.array[Any],
-    azimuths: wp.array[Any],
-    wrap: int,
-    zeros: Any,
-):
+def _hypotheses(rays: Any, b: int, row: Any, column: Any, zeros: Any):
     """The ranges r_tk of a query, number 9 t + 3 v + h for continuation v along the column and h along the row.
 
     Continuations are 0, outer; 1, inner; 2, none. No return is 0.
@@ -158,13 +146,13 @@ def _hypotheses(
     v = wp.vector(length=3, dtype=type(row))
     h = wp.vector(length=3, dtype=type(row))
     for t in range(4):
-        i, i_outer, i_inner, a_outer, b_outer, a_inner, b_inner = _along(row, t // 2, elevations, 0)
-        j, j_outer, j_inner, c_outer, d_outer, c_inner, d_inner = _along(column, t % 2, azimuths, wrap)
-        u = _inverse(image, b, i, j)
-        v[0] = _change(u, _inverse(image, b, i_outer, j), a_outer, b_outer)
-        v[1] = _change(u, _inverse(image, b, i_inner, j), a_inner, b_inner)
-        h[0] = _change(u, _inverse(image, b, i, j_outer), c_outer, d_outer)
-        h[1] = _change(u, _inverse(image, b, i, j_inner), c_inner, d_inner)
+        i, i_outer, i_inner, a_outer, b_outer, a_inner, b_inner = _along(row, t // 2, rays.elevations, 0)
+        j, j_outer, j_inner, c_outer, d_outer, c_inner, d_inner = _along(column, t % 2, rays.azimuths, rays.wrap)
+        u = _inverse(rays.image, b, i, j)
+        v[0] = _change(u, _inverse(rays.image, b, i_outer, j), a_outer, b_outer)
+        v[1] = _change(u, _inverse(rays.image, b, i_inner, j), a_inner, b_inner)
+        h[0] = _change(u, _inverse(rays.image, b, i, j_outer), c_outer, d_outer)
+        h[1] = _change(u, _inverse(rays.image, b, i, j_inner), c_inner, d_inner)
         for k in range(9):
             x = wp.clamp(u + v[k // 3] + h[k % 3], u / within, u * within)
             found[9 * t + k] = wp.where(u > zero, type(row)(1.0) / wp.max(x, type(row)(1.0e-9)), zero)
@@ -218,118 +206,6 @@ def _explain(found: Any, scales: Any, target: Any, far: Any):
     return p, gap
 
 
-@wp.kernel(enable_backward=False)
-def _hypotheses_kernel(
-    first: int,
-    # in
-    image: wp.array3d[wp.Float],
-    queries: wp.array3d[wp.Float],
-    elevations: wp.array[wp.Float],
-    azimuths: wp.array[wp.Float],
-    wrap: int,
-    # out
-    found_out: wp.array2d[_many],
-):
-    b, q = query_of(first + wp.tid(), queries.shape[1])
-    found_out[b, q] = _hypotheses(
-        image, b, queries[b, q, 0], queries[b, q, 1], elevations, azimuths, wrap, found_out.dtype()
-    )
-
-
-@wp.kernel(enable_backward=False)
-def _likelihood_kernel(
-    first: int,
-    # in
-    image: wp.array3d[wp.Float],
-    queries: wp.array3d[wp.Float],
-    elevations: wp.array[wp.Float],
-    azimuths: wp.array[wp.Float],
-    wrap: int,
-    scores: wp.array2d[_many],
-    scales: wp.array2d[_four],
-    targets: wp.array2d[wp.Float],
-    far: wp.Float,
-    # out
-    likelihood_out: wp.array2d[wp.Float],
-    error_out: wp.array2d[wp.Float],
-):
-    b, q = query_of(first + wp.tid(), queries.shape[1])
-    row = queries[b, q, 0]
-    column = queries[b, q, 1]
-    target = targets[b, q]
-    w = _weigh(scores[b, q], row, column)
-    found = _hypotheses(image, b, row, column, elevations, azimuths, wrap, scores.dtype())
-    p, gap = _explain(found, scales[b, q], target, far)
-    background = type(far)(_BACKGROUND)
-    whole = type(far)(0.0)
-    explained = type(far)(0.0)
-    error = type(far)(0.0)
-    for k in range(len(w)):
-        whole = whole + w[k]
-        explained = explained + w[k] * p[k]
-        error = error + w[k] * gap[k]
-    unexplained = wp.where(target > type(far)(0.0), background / far, background)
-    likelihood_out[b, q] = -wp.log((type(far)(1.0) - type(far)(2.0) * background) * explained / whole + unexplained)
-    error_out[b, q] = error / whole
-
-
-@wp.kernel(enable_backward=False)
-def _likelihood_backward_kernel(
-    first: int,
-    # in
-    image: wp.array3d[wp.Float],
-    queries: wp.array3d[wp.Float],
-    elevations: wp.array[wp.Float],
-    azimuths: wp.array[wp.Float],
-    wrap: int,
-    scores: wp.array2d[_many],
-    scales: wp.array2d[_four],
-    targets: wp.array2d[wp.Float],
-    far: wp.Float,
-    adj_likelihood: wp.array2d[wp.Float],
-    adj_error: wp.array2d[wp.Float],
-    # out
-    adj_scores_out: wp.array2d[_many],
-    adj_scales_out: wp.array2d[_four],
-):
-    b, q = query_of(first + wp.tid(), queries.shape[1])
-    row = queries[b, q, 0]
-    column = queries[b, q, 1]
-    target = targets[b, q]
-    w = _weigh(scores[b, q], row, column)
-    found = _hypotheses(image, b, row, column, elevations, azimuths, wrap, scores.dtype())
-    p, gap = _explain(found, scales[b, q], target, far)
-    zero = type(far)(0.0)
-    one = type(far)(1.0)
-    background = type(far)(_BACKGROUND)
-    whole = zero
-    for k in range(len(w)):
-        whole = whole + w[k]
-    explained = zero
-    error = zero
-    for k in range(len(w)):
-        w[k] = w[k] / whole
-        explained = explained + w[k] * p[k]
-        error = error + w[k] * gap[k]
-    unexplained = wp.where(target > zero, background / far, background)
-    known = one - type(far)(2.0) * background
-    factor = known / (known * explained + unexplained) * adj_likelihood[b, q]
-    adj_scores = scores.dtype()
-    for k in range(len(w)):
-        adj_scores[k] = w[k] * (adj_error[b, q] * (gap[k] - error) - factor * (p[k] - explained))
-    adj_scores_out[b, q] = adj_scores
-    adj_scales = scales.dtype()
-    for t in range(4):
-        c = scales[b, q][t]
-        inverse = one / _scale(c)
-        total = zero
-        for k in range(9):
-            total = total + w[9 * t + k] * p[9 * t + k] * (gap[9 * t + k] * inverse - one) * inverse
-        slope = type(far)(0.5) / (one + wp.exp(-c))  # of b_t in c_t
-        adj_scales[t] = wp.where(target > zero, -factor * total * slope, zero)
-    adj_scales_out[b, q] = adj_scales
-
-
 @wp.func
 def _mass(x: Any):
     """The Laplace distribution function."""
@@ -374,37 +250,158 @@ def settle(found: Any, w: Any, scales: Any):
     return median, trusted * known, none * known
 
 
-@wp.kernel(enable_backward=False)
-def _median_kernel(
-    first: int,
-    # in
-    image: wp.array3d[wp.Float],
-    queries: wp.array3d[wp.Float],
-    elevations: wp.array[wp.Float],
-    azimuths: wp.array[wp.Float],
-    wrap: int,
-    scores: wp.array2d[_many],
-    scales: wp.array2d[_four],
-    # out
-    ranges_out: wp.array2d[wp.Float],
-    confidence_out: wp.array2d[wp.Float],
-    none_out: wp.array2d[wp.Float],
-):
-    b, q = query_of(first + wp.tid(), queries.shape[1])
-    row = queries[b, q, 0]
-    column = queries[b, q, 1]
-    w = _weigh(scores[b, q], row, column)
-    found = _hypotheses(image, b, row, column, elevations, azimuths, wrap, scores.dtype())
-    median, confidence, none = settle(found, w, scales[b, q])
-    ranges_out[b, q] = median
-    confidence_out[b, q] = confidence
-    none_out[b, q] = none
+def _kernels(scalar: type) -> tuple[wp.Kernel, ...]:
+    """The kernels that compute with float32 or float64; a struct holds arrays of one of them."""
+    many, four = wp.types.vector(4 * KINDS, scalar), wp.types.vector(4, scalar)
+
+    @wp.struct
+    class Rays:
+        """What was measured, and what is asked."""
+
+        image: wp.array3d[scalar]
+        """(B, H, W) metres, 0 where nothing returned."""
+        elevations: wp.array[scalar]
+        """(H,) radians."""
+        azimuths: wp.array[scalar]
+        """(W,) radians."""
+        queries: wp.array3d[scalar]
+        """(B, Q, 2) pixel coordinates."""
+        wrap: int
+        """1 if column W-1 meets column 0, else 0."""
+
+    @wp.kernel(enable_backward=False)
+    def _hypotheses_kernel(
+        first: int,
+        # in
+        rays: Rays,
+        # out
+        found_out: wp.array2d[many],
+    ):
+        b, q = query_of(first + wp.tid(), rays.queries.shape[1])
+        found_out[b, q] = _hypotheses(rays, b, rays.queries[b, q, 0], rays.queries[b, q, 1], found_out.dtype())
+
+    @wp.kernel(enable_backward=False)
+    def _likelihood_kernel(
+        first: int,
+        # in
+        rays: Rays,
+        scores: wp.array2d[many],
+        scales: wp.array2d[four],
+        targets: wp.array2d[scalar],
+        far: scalar,
+        # out
+        likelihood_out: wp.array2d[scalar],
+        error_out: wp.array2d[scalar],
+    ):
+        b, q = query_of(first + wp.tid(), rays.queries.shape[1])
+        row = rays.queries[b, q, 0]
+        column = rays.queries[b, q, 1]
+        target = targets[b, q]
+        w = _weigh(scores[b, q], row, column)
+        found = _hypotheses(rays, b, row, column, scores.dtype())
+        p, gap = _explain(found, scales[b, q], target, far)
+        background = scalar(_BACKGROUND)
+        whole = scalar(0.0)
+        explained = scalar(0.0)
+        error = scalar(0.0)
+        for k in range(len(w)):
+            whole = whole + w[k]
+            explained = explained + w[k] * p[k]
+            error = error + w[k] * gap[k]
+        unexplained = wp.where(target > scalar(0.0), background / far, background)
+        likelihood_out[b, q] = -wp.log((scalar(1.0) - scalar(2.0) * background) * explained / whole + unexplained)
+        error_out[b, q] = error / whole
+
+    @wp.kernel(enable_backward=False)
+    def _likelihood_backward_kernel(
+        first: int,
+        # in
+        rays: Rays,
+        scores: wp.array2d[many],
+        scales: wp.array2d[four],
+        targets: wp.array2d[scalar],
+        far: scalar,
+        adj_likelihood: wp.array2d[scalar],
+        adj_error: wp.array2d[scalar],
+        # out
+        adj_scores_out: wp.array2d[many],
+        adj_scales_out: wp.array2d[four],
+    ):
+        b, q = query_of(first + wp.tid(), rays.queries.shape[1])
+        row = rays.queries[b, q, 0]
+        column = rays.queries[b, q, 1]
+        target = targets[b, q]
+        w = _weigh(scores[b, q], row, column)
+        found = _hypotheses(rays, b, row, column, scores.dtype())
+        p, gap = _explain(found, scales[b, q], target, far)
+        zero = scalar(0.0)
+        one = scalar(1.0)
+        background = scalar(_BACKGROUND)
+        whole = zero
+        for k in range(len(w)):
+            whole = whole + w[k]
+        explained = zero
+        error = zero
+        for k in range(len(w)):
+            w[k] = w[k] / whole
+            explained = explained + w[k] * p[k]
+            error = error + w[k] * gap[k]
+        unexplained = wp.where(target > zero, background / far, background)
+        known = one - scalar(2.0) * background
+        factor = known / (known * explained + unexplained) * adj_likelihood[b, q]
+        adj_scores = scores.dtype()
+        for k in range(len(w)):
+            adj_scores[k] = w[k] * (adj_error[b, q] * (gap[k] - error) - factor * (p[k] - explained))
+        adj_scores_out[b, q] = adj_scores
+        adj_scales = scales.dtype()
+        for t in range(4):
+            c = scales[b, q][t]
+            inverse = one / _scale(c)
+            total = zero
+            for k in range(9):
+                total = total + w[9 * t + k] * p[9 * t + k] * (gap[9 * t + k] * inverse - one) * inverse
+            slope = scalar(0.5) / (one + wp.exp(-c))  # of b_t in c_t
+            adj_scales[t] = wp.where(target > zero, -factor * total * slope, zero)
+        adj_scales_out[b, q] = adj_scales
+
+    @wp.kernel(enable_backward=False)
+    def _median_kernel(
+        first: int,
+        # in
+        rays: Rays,
+        scores: wp.array2d[many],
+        scales: wp.array2d[four],
+        # out
+        ranges_out: wp.array2d[scalar],
+        confidence_out: wp.array2d[scalar],
+        none_out: wp.array2d[scalar],
+    ):
+        b, q = query_of(first + wp.tid(), rays.queries.shape[1])
+        row = rays.queries[b, q, 0]
+        column = rays.queries[b, q, 1]
+        w = _weigh(scores[b, q], row, column)
+        found = _hypotheses(rays, b, row, column, scores.dtype())
+        median, confidence, none = settle(found, w, scales[b, q])
+        ranges_out[b, q] = median
+        confidence_out[b, q] = confidence
+        none_out[b, q] = none
+
+    return _hypotheses_kernel, _likelihood_kernel, _likelihood_backward_kernel, _median_kernel
 
 
-_found = overload(_hypotheses_kernel)
-_likelihood = overload(_likelihood_kernel)
-_likelihood_backward = overload(_likelihood_backward_kernel)
-_median = overload(_median_kernel)
+_SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
+_made = {dtype: _kernels(scalar) for dtype, scalar in _SCALARS.items()}
+_found, _likelihood, _likelihood_backward, _median = (
+    {dtype: kernels[n] for dtype, kernels in _made.items()} for n in range(4)
+)
+
+
+def _rays(
+    image: torch.Tensor, queries: torch.Tensor, elevations: torch.Tensor, azimuths: torch.Tensor, wrap: bool
+) -> dict[str, Any]:
+    """The fields of `Rays`, for `launch`."""
+    tensors = {"image": image, "elevations": elevations, "azimuths": azimuths, "queries": queries}
+    return {**tensors, "wrap": int(wrap)}
 
 
 @torch.library.custom_op("kernels::surface_hypotheses", mutates_args=())
@@ -413,7 +410,7 @@ def _surface_hypotheses(
 ) -> torch.Tensor:
     batch, count, _ = queries.shape
     found = image.new_empty(batch, count, 4, KINDS)
-    inputs = [image, queries, elevations, azimuths, int(wrap)]
+    inputs = [_rays(image, queries, elevations, azimuths, wrap)]
     launch(_found[image.dtype], batch * count, inputs, [found])
     return found
 
@@ -438,7 +435,7 @@ def _surface_likelihood(
     far: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     likelihood, error = torch.empty_like(targets), torch.empty_like(targets)
-    inputs = [image, queries, elevations, azimuths, int(wrap), scores, scales, targets, far]
+    inputs = [_rays(image, queries, elevations, azimuths, wrap), scores, scales, targets, far]
     launch(_likelihood[image.dtype], targets.numel(), inputs, [likelihood, error])
     return likelihood, error
 
@@ -473,7 +470,15 @@ def _surface_likelihood_backward(
     adj_error: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     adj_scores, adj_scales = torch.empty_like(scores), torch.empty_like(scales)
-    inputs = [image, queries, elevations, azimuths, int(wrap), scores, scales, targets, far, adj_likelihood, adj_error]
+    inputs = [
+        _rays(image, queries, elevations, azimuths, wrap),
+        scores,
+        scales,
+        targets,
+        far,
+        adj_likelihood,
+        adj_error,
+    ]
     launch(_likelihood_backward[image.dtype], targets.numel(), inputs, [adj_scores, adj_scales])
     return adj_scores, adj_scales
 
@@ -524,7 +529,7 @@ def _surface_median(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     shape = queries.shape[:2]
     ranges, confidence, none = image.new_empty(shape), image.new_empty(shape), image.new_empty(shape)
-    inputs = [image, queries, elevations, azimuths, int(wrap), scores, scales]
+    inputs = [_rays(image, queries, elevations, azimuths, wrap), scores, scales]
     launch(_median[image.dtype], ranges.numel(), inputs, [ranges, confidence, none])
     return ranges, confidence, none
 
@@ -579,7 +584,7 @@ def surface_hypotheses(
 
     Source: ours, Eq. (2) of `kernels.surfaces`.
     """
-    batch, image, queries, tables = _rays(image, queries, elevations, azimuths, backend)
+    batch, image, queries, tables = _checked(image, queries, elevations, azimuths, backend)
     op = reference.surface_hypotheses if backend == "torch" else _surface_hypotheses
     return op(image, queries, *tables, wrap).view(*batch, -1, 4, KINDS)
 
@@ -624,7 +629,7 @@ def surface_likelihood(
     """
     if not far > 0:
         raise ValueError(f"far is {far}; it should be a number of metres above 0")
-    batch, image, queries, tables = _rays(image, queries, elevations, azimuths, backend)
+    batch, image, queries, tables = _checked(image, queries, elevations, azimuths, backend)
     count = queries.shape[1]
     scores = _of_queries("scores", scores, batch, (count, 4, KINDS), image)
     scales = _of_queries("scales", scales, batch, (count, 4), image)
@@ -667,7 +672,7 @@ def surface_median(
 
     Source: ours, see `kernels.surfaces`.
     """
-    batch, image, queries, tables = _rays(image, queries, elevations, azimuths, backend)
+    batch, image, queries, tables = _checked(image, queries, elevations, azimuths, backend)
     count = queries.shape[1]
     scores = _of_queries("scores", scores.detach(), batch, (count, 4, KINDS), image)
     scales = _of_queries("scales", scales.detach(), batch, (count, 4), image)
@@ -676,7 +681,7 @@ def surface_median(
     return ranges.view(*batch, count), confidence.view(*batch, count), none.view(*batch, count)
 
 
-def _rays(
+def _checked(
     image: torch.Tensor, queries: torch.Tensor, elevations: torch.Tensor, azimuths: torch.Tensor, backend: str
 ) -> tuple[torch.Size, torch.Tensor, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
     """Checks what all these ops take, and folds leading dimensions into one."""
@@ -685,7 +690,6 @@ def _rays(
     if image.ndim < 2 or 0 in image.shape[-2:]:
         raise ValueError(f"image has shape {tuple(image.shape)}; it should be (..., H, W), neither of them 0")
     check_queries(queries)
-    check_devices(image=image, queries=queries)
     tables = []
     for name, table, count in (
         ("elevations", elevations, image.shape[-2]),
@@ -694,8 +698,8 @@ def _rays(
         check_floating(name, table, [torch.float32, torch.float64], f"({count},)")
         if table.shape != (count,):
             raise ValueError(f"{name} has shape {tuple(table.shape)}; it should be ({count},), as the image has it")
-        check_devices(**{"image": image, name: table})
         tables.append(table.detach().to(image.dtype).contiguous())
+    check_devices(image=image, queries=queries, elevations=elevations, azimuths=azimuths)
     queries = queries.detach().to(image.dtype)
     batch, (image, queries) = broadcast_batch(image=(image.detach(), 2), queries=(queries, 2))
     return batch, image.contiguous(), queries.contiguous(), (tables[0], tables[1])
@@ -708,5 +712,5 @@ def _of_queries(
     check_floating(name, tensor, [torch.float32, torch.float64, torch.bfloat16, torch.float16], "of the queries")
     if tensor.shape != (*batch, *shape):
         raise ValueError(f"{name} has shape {tuple(tensor.shape)}; it should be {(*batch, *shape)}")
-    check_devices(**{"image": image, name: tensor})
+    check_devices(image=image, **{name: tensor})
     return tensor.to(image.dtype).reshape(len(image), *shape).contiguous()
