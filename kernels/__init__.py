@@ -1,4 +1,4 @@
-"""Warp ops for torch tensors: rays, neighbours, and the fused blend of the Implicit LiDAR Network."""
+"""Warp ops for torch tensors: rays, the neighbours of a query, and the fused steps of the Implicit LiDAR Network."""
 
 from kernels.area_blend import area_blend
 from kernels.attention import attend_neighbours

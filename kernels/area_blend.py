@@ -2,8 +2,8 @@
 
     r̂ = Σ_t (S_t / S) v_t,    ∂r̂/∂v_t = S_t / S
 
-S_t is the area of the rectangle between the query and the neighbour diagonally opposite to t. With the neighbours' own
-ranges as values this is bilinear interpolation; LIIF lets a network predict the values.
+S_t is the area of the rectangle between the query and the neighbour diagonally opposite to t (`kernels.stencil.area`).
+With the neighbours' own ranges as values v_t this is bilinear interpolation. In LIIF a network predicts the values.
 """
 
 from typing import Any
@@ -21,7 +21,7 @@ __all__ = ["area_blend"]
 
 
 def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
-    """The forward and the backward kernel whose threads take n queries each."""
+    """Returns the forward and the backward kernel whose threads take n queries each."""
     two = wp.types.vector(2 * n, wp.Float)
     one_stored, four_stored = (wp.types.vector(n * numbers, wp.Scalar) for numbers in (1, 4))
 
@@ -71,32 +71,34 @@ _blend = {(dtype, n): forward[dtype] for n, (forward, _) in _made.items() for dt
 _blend_backward = {(dtype, n): backward[dtype] for n, (_, backward) in _made.items() for dtype in backward}
 
 
+def _empty_blended(values: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
+    return values.new_empty(values.shape[0])
+
+
 @torch.library.custom_op("kernels::area_blend", mutates_args=())
 def _area_blend(values: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
-    blended = values.new_empty(len(values))
+    blended = _empty_blended(values, queries)
     for n, part in query_blocks(len(values), values.device):
         threads = (part.stop - part.start) // n
         launch(_blend[values.dtype, n], threads, [values[part], queries[part]], [blended[part]])
     return blended
 
 
-@_area_blend.register_fake
-def _(values: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
-    return values.new_empty(values.shape[0])
+def _empty_adj_values(adj_blended: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
+    return adj_blended.new_empty(adj_blended.shape[0], 4)
 
 
 @torch.library.custom_op("kernels::area_blend_backward", mutates_args=())
 def _area_blend_backward(adj_blended: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
-    adj_values = adj_blended.new_empty(len(queries), 4)
+    adj_values = _empty_adj_values(adj_blended, queries)
     for n, part in query_blocks(len(queries), queries.device):
         threads = (part.stop - part.start) // n
         launch(_blend_backward[adj_blended.dtype, n], threads, [adj_blended[part], queries[part]], [adj_values[part]])
     return adj_values
 
 
-@_area_blend_backward.register_fake
-def _(adj_blended: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
-    return adj_blended.new_empty(queries.shape[0], 4)
+_area_blend.register_fake(_empty_blended)
+_area_blend_backward.register_fake(_empty_adj_values)
 
 
 def _setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
@@ -119,8 +121,8 @@ def area_blend(values: torch.Tensor, queries: torch.Tensor, backend: str = "warp
     Differentiable in `values`.
 
     Args:
-        values: (..., Q, 4) of any floating-point dtype and unit, one per neighbour in the order (row-, col-),
-            (row-, col+), (row+, col-), (row+, col+). Half precision is summed in float32.
+        values: (..., Q, 4) float32, float64, bfloat16 or float16, of any unit, one per neighbour in the order
+            (row-, col-), (row-, col+), (row+, col-), (row+, col+). Half precision is summed in float32.
         queries: (..., Q, 2) pixel coordinates (row, column). Leading dimensions broadcast against those of `values`.
         backend: "warp", or "torch" for the plain twin in `kernels.reference`.
 

@@ -1,11 +1,12 @@
 """attend_neighbours: multi-head self-attention among the 4 neighbours of each query (paper, Fig. 3b).
 
-With q, k, v the 4 rows of one head and D their length, and backwards from the gradient G of the output:
+Let q, k and v (4, D) be the queries, keys and values of one head, one row per neighbour, and G the gradient of the
+output. Then, forward and backward:
 
     P = softmax(q kᵀ / √D),    out = P v
     S = P ∘ (G vᵀ - rowsum(P ∘ G vᵀ)),    ∂q = S k / √D,    ∂k = Sᵀ q / √D,    ∂v = Pᵀ G
 
-A 4×4 problem is far too small for a matrix library: one thread does one head of one query in registers.
+A 4×4 problem is far too small for a matrix library, so one thread does one head of one query in registers.
 """
 
 import math
@@ -24,7 +25,7 @@ __all__ = ["adj_logits", "attend_neighbours", "softmax_rows"]
 
 @wp.func
 def softmax_rows(logits: Any):
-    """P (4, 4) from q kᵀ / √D."""
+    """Attention map P (4, 4) from the logits q kᵀ / √D."""
     p = logits
     for i in range(4):
         largest = wp.max(wp.max(p[i, 0], p[i, 1]), wp.max(p[i, 2], p[i, 3]))
@@ -38,7 +39,7 @@ def softmax_rows(logits: Any):
 
 @wp.func
 def adj_logits(p: Any, adj_p: Any):
-    """S from P and G vᵀ."""
+    """S, the gradient of the logits, from P and the gradient G vᵀ of P."""
     s = adj_p
     for i in range(4):
         mean = p[i, 0] * s[i, 0] + p[i, 1] * s[i, 1] + p[i, 2] * s[i, 2] + p[i, 3] * s[i, 3]
@@ -49,9 +50,9 @@ def adj_logits(p: Any, adj_p: Any):
 
 @wp.func
 def _four(array: wp.array4d[Any], n: int, step: int, start: int, h: int, d: int, scale: Any):
-    """Entries start, start + step, ... of array[n, :, h, d]: one for each neighbour.
+    """The 4 entries start, start + step, ... of array[n, :, h, d], one for each neighbour.
 
-    In qkv the neighbours' queries, keys and values stand in turn: 3 t, 3 t + 1, 3 t + 2.
+    In qkv neighbour t has its query at 3 t, its key at 3 t + 1 and its value at 3 t + 2.
     """
     values = wp.vector(dtype=type(scale), length=4)
     for t in range(4):
@@ -61,7 +62,7 @@ def _four(array: wp.array4d[Any], n: int, step: int, start: int, h: int, d: int,
 
 @wp.func
 def _attention_map(qkv: wp.array4d[Any], n: int, h: int, scale: Any):
-    """P (4, 4) of head h of query n."""
+    """Attention map P (4, 4) of head h of query n."""
     logits = wp.matrix(shape=(4, 4), dtype=type(scale))
     for d in range(qkv.shape[3]):
         logits = logits + wp.outer(_four(qkv, n, 3, 0, h, d, scale) * scale, _four(qkv, n, 3, 1, h, d, scale))
@@ -119,31 +120,33 @@ _attend = overload(_attend_neighbours_kernel, half=True)
 _attend_backward = overload(_attend_neighbours_backward_kernel, half=True)
 
 
+def _empty_attended(qkv: torch.Tensor) -> torch.Tensor:
+    count, _, heads, width = qkv.shape
+    return qkv.new_empty(count, 4, heads, width)
+
+
 @torch.library.custom_op("kernels::attend_neighbours", mutates_args=())
 def _attend_neighbours_op(qkv: torch.Tensor) -> torch.Tensor:
     count, _, heads, width = qkv.shape
-    attended = qkv.new_empty(count, 4, heads, width)
+    attended = _empty_attended(qkv)
     launch(_attend[qkv.dtype], count * heads, [qkv, 1 / math.sqrt(width)], [attended])
     return attended
 
 
-@_attend_neighbours_op.register_fake
-def _(qkv: torch.Tensor) -> torch.Tensor:
-    count, _, heads, width = qkv.shape
-    return qkv.new_empty(count, 4, heads, width)
+def _empty_adj_qkv(qkv: torch.Tensor, adj_attended: torch.Tensor) -> torch.Tensor:
+    return qkv.new_empty(qkv.shape)
 
 
 @torch.library.custom_op("kernels::attend_neighbours_backward", mutates_args=())
 def _attend_neighbours_backward_op(qkv: torch.Tensor, adj_attended: torch.Tensor) -> torch.Tensor:
     count, _, heads, width = qkv.shape
-    adj_qkv = qkv.new_empty(qkv.shape)
+    adj_qkv = _empty_adj_qkv(qkv, adj_attended)
     launch(_attend_backward[qkv.dtype], count * heads, [qkv, adj_attended, 1 / math.sqrt(width)], [adj_qkv])
     return adj_qkv
 
 
-@_attend_neighbours_backward_op.register_fake
-def _(qkv: torch.Tensor, adj_attended: torch.Tensor) -> torch.Tensor:
-    return qkv.new_empty(qkv.shape)
+_attend_neighbours_op.register_fake(_empty_attended)
+_attend_neighbours_backward_op.register_fake(_empty_adj_qkv)
 
 
 def _setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
@@ -163,14 +166,16 @@ fold_into_batch(_attend_neighbours_backward_op)
 def attend_neighbours(qkv: torch.Tensor, heads: int, backend: str = "warp") -> torch.Tensor:
     """Lets the 4 neighbours of each query attend to each other.
 
+    Differentiable.
+
     Args:
         qkv: (..., 4, 3·C) float32, float64, bfloat16 or float16: queries, keys and values of each neighbour, in the
-            order of a `Linear(C, 3·C)`; each is split into heads.
+            order of a `Linear(C, 3·C)`. Each of the three is split into heads.
         heads: Number of heads; it divides C.
         backend: "warp", or "torch" for the plain twin in `kernels.reference`.
 
     Returns:
-        (..., 4, C), the heads' results side by side; half precision is computed in float32.
+        (..., 4, C), the results of the heads side by side. Half precision is computed in float32.
 
     Raises:
         TypeError: If `qkv` is not a floating-point tensor of a supported dtype.
@@ -180,7 +185,9 @@ def attend_neighbours(qkv: torch.Tensor, heads: int, backend: str = "warp") -> t
     """
     check_backend(backend)
     check_floating("qkv", qkv, _attend, "(..., 4, 3·C)")
-    if qkv.ndim < 2 or qkv.shape[-2] != 4 or heads < 1 or qkv.shape[-1] == 0 or qkv.shape[-1] % (3 * heads):
+    if heads < 1:
+        raise ValueError(f"heads is {heads}; it should be at least 1")
+    if qkv.ndim < 2 or qkv.shape[-2] != 4 or qkv.shape[-1] == 0 or qkv.shape[-1] % (3 * heads):
         raise ValueError(
             f"qkv has shape {tuple(qkv.shape)}; it should be (..., 4, 3·C) with C a multiple of the {heads} heads"
         )

@@ -1,4 +1,8 @@
-"""gather_neighbours: features and offsets of the 4 pixels around each query (paper, Sec. II-B, z_t and Δq_t)."""
+"""gather_neighbours: features z_t and offsets Δq_t of the 4 pixels around each query (paper, Sec. II-B).
+
+`kernels.stencil` says which pixels these are. The gradient of a pixel is the sum over all queries that have it as a
+neighbour (`kernels.scatter`).
+"""
 
 from typing import Any
 
@@ -49,24 +53,24 @@ def _gather_neighbours_kernel(
 _gather = overload_vectors(_gather_neighbours_kernel, half=True)
 
 
-@torch.library.custom_op("kernels::gather_neighbours", mutates_args=())
-def _gather_neighbours(features: torch.Tensor, queries: torch.Tensor, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    batch, height, image_width, channels = features.shape
-    count = queries.shape[1]
-    gathered = features.new_empty(batch, count, 4, channels)
-    offsets = queries.new_empty(batch, count, 4, 2)
-    width = vector_width(channels)
-    span, spans = channel_spans(channels // width, features.device)
-    inputs = [features, queries, span, grid_of(height, image_width, wrap)]
-    launch(_gather[features.dtype, width], batch * count * 4 * spans, inputs, [gathered, offsets])
-    return gathered, offsets
-
-
-@_gather_neighbours.register_fake
-def _(features: torch.Tensor, queries: torch.Tensor, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
+def _empty_outputs(features: torch.Tensor, queries: torch.Tensor, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
     batch, _, _, channels = features.shape
     count = queries.shape[1]
     return features.new_empty(batch, count, 4, channels), queries.new_empty(batch, count, 4, 2)
+
+
+@torch.library.custom_op("kernels::gather_neighbours", mutates_args=())
+def _gather_neighbours(features: torch.Tensor, queries: torch.Tensor, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    batch, height, width, channels = features.shape
+    gathered, offsets = _empty_outputs(features, queries, wrap)
+    lanes = vector_width(channels)
+    span, spans = channel_spans(channels // lanes, features.device)
+    inputs = [features, queries, span, grid_of(height, width, wrap)]
+    launch(_gather[features.dtype, lanes], batch * queries.shape[1] * 4 * spans, inputs, [gathered, offsets])
+    return gathered, offsets
+
+
+_gather_neighbours.register_fake(_empty_outputs)
 
 
 def _setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
@@ -95,16 +99,16 @@ def gather_neighbours(
     Differentiable in `features`; `queries` and the offsets carry no gradient. The backward pass is deterministic.
 
     Args:
-        features: (..., C, H, W) of any floating-point dtype. Memory format `channels_last` is read in place. The
-            gradients of half precision are summed in float32.
+        features: (..., C, H, W) float32, float64, bfloat16 or float16. Memory format `channels_last` is read in place.
+            The gradients of half precision are summed in float32.
         queries: (..., Q, 2) pixel coordinates (row, column); integers are pixel centres. Leading dimensions broadcast
             against those of `features`.
-        wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
+        wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp. Rows always clamp.
         backend: "warp", or "torch" for the plain twin in `kernels.reference`.
 
     Returns:
         gathered: (..., Q, 4, C), neighbours in the order (row-, col-), (row-, col+), (row+, col-), (row+, col+).
-        offsets: (..., Q, 4, 2), query minus neighbour in pixels; float64 where the features are, else float32.
+        offsets: (..., Q, 4, 2), query minus neighbour in pixels; float64 if the features are, else float32.
 
     Raises:
         TypeError: If `features` or `queries` is not a floating-point tensor of a supported dtype.

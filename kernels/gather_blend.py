@@ -2,15 +2,15 @@
 
     r̂ = Σ_t w_t r_t,    w = softmax(s + p),    p_t = 0 | log a_t | log a_t - log r_t
 
-a_t are the bilinear areas. Zero scores give the mean of the neighbours, bilinear interpolation, or bilinear
-interpolation of *inverse* range: 1 / Σ_t a_t / r_t = Σ_t w_t r_t with w_t ∝ a_t / r_t. On a plane n·x = c the range
-along a direction d is c / (n·d), so that 1/r is linear in d and this last blend keeps planes flat.
+a_t are the bilinear areas S_t / S. With zero scores the three priors give the mean of the neighbours, bilinear
+interpolation, and bilinear interpolation of *inverse* range: 1 / Σ_t a_t / r_t = Σ_t w_t r_t with w_t ∝ a_t / r_t. On a
+plane n·x = c the range along a direction d is c / (n·d), so 1/r is linear in d, and the last blend keeps planes flat.
 
 The gradients follow from ∂w_t/∂s_u = w_t (δ_tu - w_u):
 
     ∂r̂/∂s_t = w_t (r_t - r̂)
-    ∂r̂/∂r_t = w_t                                        priors that do not see the range
-    ∂r̂/∂r_t = w_t + w_t (r_t - r̂) · (-1 / r_t) = w_t r̂ / r_t    the perspective prior
+    ∂r̂/∂r_t = w_t                                               for priors without r_t
+    ∂r̂/∂r_t = w_t + w_t (r_t - r̂) · (-1 / r_t) = w_t r̂ / r_t    for the perspective prior
 """
 
 from typing import Any, Literal
@@ -43,7 +43,7 @@ _RANGE_FLOOR = wp.constant(RANGE_FLOOR)
 
 
 def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
-    """The forward and the backward kernel whose threads take n queries each."""
+    """Returns the forward and the backward kernel whose threads take n queries each."""
     one, two, four = (wp.types.vector(n * numbers, wp.Float) for numbers in (1, 2, 4))
     four_stored = wp.types.vector(n * 4, wp.Scalar)
     m = 4 * n
@@ -76,7 +76,7 @@ def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
         at = queries[b, q]
         s = scores[b, q]
         r = ranges(image, b, at, weights_out.dtype(), grid)
-        p = weights_out.dtype()  # exp of the prior: a factor, so that neither 0 nor its logarithm is special
+        p = weights_out.dtype()  # exp of the prior, as a factor: an area of 0 needs no logarithm
         x = weights_out.dtype()
         for k in range(m):
             p[k] = image.dtype(1.0)
@@ -84,16 +84,16 @@ def _kernels(n: int) -> tuple[wp.Kernel, wp.Kernel]:
             for k in range(m):
                 p[k] = area(at[k // 4 * 2], at[k // 4 * 2 + 1], k % 4)
             for k in range(m):
-                p[k] = wp.where(p[k] > area_floor, p[k], area_floor)
+                p[k] = wp.where(p[k] < area_floor, area_floor, p[k])  # not `max`, which may drop NaN
         if prior == _PERSPECTIVE:
             for k in range(m):
-                p[k] = p[k] / wp.where(r[k] > image.dtype(_RANGE_FLOOR), r[k], image.dtype(_RANGE_FLOOR))
+                p[k] = p[k] / wp.where(r[k] < image.dtype(_RANGE_FLOOR), image.dtype(_RANGE_FLOOR), r[k])
         for k in range(m):
-            x[k] = wp.where(p[k] > image.dtype(0.0), image.dtype(s[k]), image.dtype(-wp.inf))
+            x[k] = wp.where(p[k] <= image.dtype(0.0), image.dtype(-wp.inf), image.dtype(s[k]))
         for k in range(n):
             upper = wp.where(x[4 * k] > x[4 * k + 1], x[4 * k], x[4 * k + 1])
             lower = wp.where(x[4 * k + 2] > x[4 * k + 3], x[4 * k + 2], x[4 * k + 3])
-            largest = wp.where(upper > lower, upper, lower)  # score of a neighbour that the prior lets in
+            largest = wp.where(upper > lower, upper, lower)  # of the neighbours whose area is not 0
             for t in range(4):
                 x[4 * k + t] = x[4 * k + t] - largest
         w = wp.cw_mul(p, exp2(x * image.dtype(1.4426950408889634)))
@@ -177,13 +177,19 @@ _blend = {(dtype, n): forward[dtype] for n, (forward, _) in _made.items() for dt
 _blend_backward = {(dtype, n): backward[dtype] for n, (_, backward) in _made.items() for dtype in backward}
 
 
+def _empty_outputs(
+    image: torch.Tensor, queries: torch.Tensor, scores: torch.Tensor, prior: int, area_floor: float, wrap: bool
+) -> tuple[torch.Tensor, torch.Tensor]:
+    return image.new_empty(scores.shape[:2]), image.new_empty(scores.shape)
+
+
 @torch.library.custom_op("kernels::gather_blend", mutates_args=())
 def _gather_blend(
     image: torch.Tensor, queries: torch.Tensor, scores: torch.Tensor, prior: int, area_floor: float, wrap: bool
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    batch, count, _ = scores.shape
+    count = scores.shape[1]
     _, height, width = image.shape
-    blended, weights = image.new_empty(batch, count), image.new_empty(batch, count, 4)
+    blended, weights = _empty_outputs(image, queries, scores, prior, area_floor, wrap)
     for n, part in query_blocks(count, image.device):
         inputs = [image, queries[:, part], scores[:, part], area_floor, prior, grid_of(height, width, wrap)]
         outputs = [blended[:, part], weights[:, part]]
@@ -191,11 +197,21 @@ def _gather_blend(
     return blended, weights
 
 
-@_gather_blend.register_fake
-def _(
-    image: torch.Tensor, queries: torch.Tensor, scores: torch.Tensor, prior: int, area_floor: float, wrap: bool
+_gather_blend.register_fake(_empty_outputs)
+
+
+def _empty_gradients(
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    weights: torch.Tensor,
+    adj_blended: torch.Tensor,
+    adj_weights: torch.Tensor | None,
+    prior: int,
+    wrap: bool,
+    scores: torch.dtype,
+    for_image: bool,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    return image.new_empty(scores.shape[:2]), image.new_empty(scores.shape)
+    return weights.new_empty(weights.shape, dtype=scores), image.new_empty(image.shape if for_image else 0)
 
 
 @torch.library.custom_op("kernels::gather_blend_backward", mutates_args=())
@@ -211,7 +227,9 @@ def _gather_blend_backward(
     for_image: bool,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     batch, count, _ = weights.shape
-    adj_scores = weights.new_empty(weights.shape, dtype=scores)
+    adj_scores, adj_image = _empty_gradients(
+        image, queries, weights, adj_blended, adj_weights, prior, wrap, scores, for_image
+    )
     _, height, width = image.shape
     grid = grid_of(height, width, wrap)
     blocks = query_blocks(count, weights.device)
@@ -219,36 +237,24 @@ def _gather_blend_backward(
     adj_ranges = None if on_cpu or not for_image else weights.new_empty(weights.shape)
     # On a CPU few threads sum gradients of the image, each in a slice of its own (`kernels.scatter.sum_by_query`).
     slices = -(-PARTS // max(batch, 1))
-    adj_image = weights.new_empty(batch, slices * len(blocks), height * width) if on_cpu and for_image else None
+    shares = weights.new_empty(batch, slices * len(blocks), height * width) if on_cpu and for_image else None
     for i, (n, part) in enumerate(blocks):
         threads, least, own = (part.stop - part.start) // n, LEAST, None
-        if adj_image is not None:
+        if shares is not None:
             threads, least = slices, 1
-            own = adj_image[:, i * slices : (i + 1) * slices]
+            own = shares[:, i * slices : (i + 1) * slices]
         adjoints = [adj_blended[:, part], None if adj_weights is None else adj_weights[:, part]]
         inputs = [image, queries[:, part], weights[:, part], *adjoints, prior, grid, threads]
         outputs = [adj_scores[:, part], None if adj_ranges is None else adj_ranges[:, part], own]
         launch(_blend_backward[scores, n], batch * threads, inputs, outputs, least)
-    if adj_image is not None:
-        return adj_scores, sum_slices(adj_image.unsqueeze(-1)).view(image.shape)
-    if adj_ranges is not None:
-        return adj_scores, adjoint_of_gather(adj_ranges.unsqueeze(-1), queries, height, width, wrap).squeeze(-1)
-    return adj_scores, image.new_empty(0)
+    if shares is not None:
+        adj_image = sum_slices(shares.unsqueeze(-1)).view(image.shape)
+    elif adj_ranges is not None:
+        adj_image = adjoint_of_gather(adj_ranges.unsqueeze(-1), queries, height, width, wrap).squeeze(-1)
+    return adj_scores, adj_image
 
 
-@_gather_blend_backward.register_fake
-def _(
-    image: torch.Tensor,
-    queries: torch.Tensor,
-    weights: torch.Tensor,
-    adj_blended: torch.Tensor,
-    adj_weights: torch.Tensor | None,
-    prior: int,
-    wrap: bool,
-    scores: torch.dtype,
-    for_image: bool,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    return weights.new_empty(weights.shape, dtype=scores), image.new_empty(image.shape if for_image else 0)
+_gather_blend_backward.register_fake(_empty_gradients)
 
 
 def _setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
@@ -321,22 +327,22 @@ def gather_blend(
 
     Args:
         image: (..., H, W) float32 or float64 ranges in metres, no return already filled. Other units serve as well,
-            but the perspective prior wants positive ranges and takes those below 0.1 as 0.1. Half precision is
-            refused: bfloat16 rounds 80 m by 0.25 m.
+            but the perspective prior needs positive ranges and takes those below 0.1 as 0.1. Half precision is
+            refused, since bfloat16 rounds 80 m by up to 0.25 m.
         queries: (..., Q, 2) pixel coordinates (row, column); integers are pixel centres.
         scores: (..., Q, 4), one per neighbour in the order (row-, col-), (row-, col+), (row+, col-), (row+, col+), of
-            the image's dtype; beside a float32 image also bfloat16 or float16, computed with in float32. The leading
-            dimensions of the three broadcast. Four scores of -inf give NaN.
-        prior: What zero scores mean: "none" the mean of the neighbours (the paper), "bilinear" bilinear interpolation,
+            the image's dtype. Beside a float32 image they may be bfloat16 or float16 and are computed with in float32.
+            The leading dimensions of the three broadcast. Four scores of -inf give NaN.
+        prior: What zero scores give: "none" the mean of the neighbours (the paper), "bilinear" bilinear interpolation,
             "perspective" bilinear interpolation of inverse range, which keeps planes flat.
-        wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
-        area_floor: Least bilinear area in the prior. Above 0, scores can overrule a neighbour's area of 0.
+        wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp. Rows always clamp.
+        area_floor: Least bilinear area in the prior. Above 0, scores can overrule an area of 0.
         return_weights: Whether to return the weights as well.
         backend: "warp", or "torch" for the plain twin in `kernels.reference`.
 
     Returns:
-        blended: (..., Q) metres, within the range of the 4 neighbours; of the image's dtype.
-        weights: (..., Q, 4), positive, summing to 1, of the scores' dtype; with `return_weights` only.
+        blended: (..., Q) metres, between the least and the greatest of the 4 ranges, of the image's dtype.
+        weights: (..., Q, 4), positive, summing to 1, of the scores' dtype; only with `return_weights`.
 
     Raises:
         TypeError: If an argument is not a tensor of a supported dtype.
@@ -348,7 +354,7 @@ def gather_blend(
     if prior not in PRIORS:
         raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}")
     if not 0 <= area_floor <= 0.25:
-        raise ValueError(f"area_floor is {area_floor}; it should be between 0 and 0.25, the area at a cell's centre")
+        raise ValueError(f"area_floor is {area_floor}; it should be between 0 and 0.25, the area midway between pixels")
     check_floating("image", image, [torch.float32, torch.float64], "(..., H, W)")
     check_floating("scores", scores, [dtype for dtype, _ in _blend], "(..., Q, 4)")
     if image.ndim < 2 or 0 in image.shape[-2:]:
@@ -357,8 +363,8 @@ def gather_blend(
     check_devices(image=image, queries=queries, scores=scores)
     if image.dtype != torch.promote_types(scores.dtype, torch.float32):
         raise TypeError(
-            f"scores is {scores.dtype}, image {image.dtype}; they should have one dtype, or scores half precision"
-            " beside an image in float32"
+            f"scores is {scores.dtype}; it should be {image.dtype}, as image is, or half precision beside a float32"
+            " image"
         )
     if scores.ndim < 2 or scores.shape[-2:] != (queries.shape[-2], 4):
         raise ValueError(f"scores has shape {tuple(scores.shape)}; it should be (..., {queries.shape[-2]}, 4)")

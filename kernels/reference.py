@@ -1,6 +1,6 @@
-"""Every op again in plain PyTorch, written to be read: the oracle of the tests and the backend "torch".
+"""Every op again in plain PyTorch, written to be read. These are the oracle of the tests and the backend "torch".
 
-Shapes are those of the ops with the leading dimensions folded into one batch B; autograd derives the gradients.
+Shapes are those of the ops, with the leading dimensions folded into one batch B. Autograd derives the gradients.
 """
 
 import math
@@ -55,8 +55,9 @@ def neighbours(
         offsets: (..., 4, 2), query minus neighbour in pixels.
     """
     row, column = queries.unbind(-1)
-    # Absurd coordinates stay within what the kernels' integers hold.
-    below, left = (c.floor().nan_to_num(0).clamp(-(2**30), 2**30).long() for c in (row, column))
+    # Coordinates are kept within ±2^30, as the kernels do, whose integers have 32 bits; NaN counts as -2^30.
+    limit = 2.0**30
+    below, left = (c.nan_to_num(-limit).clamp(-limit, limit).floor().long() for c in (row, column))
     rows = torch.stack([below, below, below + 1, below + 1], -1).clamp(0, height - 1)
     columns = torch.stack([left, left + 1, left, left + 1], -1)
     if not wrap:
@@ -130,7 +131,8 @@ def neighbour_attention(
     gathered, q = gather_neighbours(pixels.movedim(3, 1), queries, wrap)
     a, squares, u, _ = gathered.split([4 * channels, 1, 2, gathered.shape[-1] - 4 * channels - 3], -1)
     qkv, tokens = (a + q @ slope).split([3 * channels, channels], -1)
-    variance = (squares + 2 * (q * u).sum(-1, keepdim=True) + ((q @ gram) * q).sum(-1, keepdim=True)) / channels
+    sums = squares + 2 * (q * u).sum(-1, keepdim=True) + ((q @ gram) * q).sum(-1, keepdim=True)
+    variance = sums.clamp(min=0) / channels  # the polynomial may be rounded to below 0
     qkv = qkv / (variance + eps).sqrt() + shift
     attended = attend_neighbours(qkv.reshape(-1, 12, channels // heads, heads).transpose(2, 3))
     return tokens + F.linear(attended.transpose(2, 3).reshape(tokens.shape), weight, bias)
@@ -142,7 +144,9 @@ def plane_prior(
     """`kernels.plane_prior` on image (B, H, W) and queries (B, Q, 2)."""
 
     def step(x: torch.Tensor) -> torch.Tensor:
-        return (x >= 0.5).to(x.dtype) if sharpness >= SHARPEST else 1 / (1 + ((1 - x) / x) ** sharpness)
+        if sharpness >= SHARPEST:
+            return (x >= 0.5).to(x.dtype).where(~x.isnan(), x)
+        return 1 / (1 + ((1 - x) / x) ** sharpness)
 
     height = image.shape[1]
     rows, columns, _ = neighbours(queries, height, image.shape[2], wrap)
@@ -186,7 +190,8 @@ def fused_decode(
     pixels, slope, shift, gram, heads = projected
     weight, bias = weights.output
     weight = weight[:, torch.arange(len(bias), device=bias.device).view(heads, -1).T.reshape(-1)]
-    t = neighbour_attention(pixels, queries.to(pixels.dtype), slope, shift, gram, weight, bias, heads, eps, wrap)
+    image, queries = image.to(pixels.dtype), queries.to(pixels.dtype)
+    t = neighbour_attention(pixels, queries, slope, shift, gram, weight, bias, heads, eps, wrap)
     hidden = F.gelu(F.linear(F.layer_norm(t, bias.shape, weights.norm[0], weights.norm[1], eps), *weights.hidden))
     t = t + F.linear(hidden, *weights.back)
     scores = F.linear(

@@ -586,7 +586,7 @@ def surface_hypotheses(
     """
     batch, image, queries, tables = _checked(image, queries, elevations, azimuths, backend)
     op = reference.surface_hypotheses if backend == "torch" else _surface_hypotheses
-    return op(image, queries, *tables, wrap).view(*batch, -1, 4, KINDS)
+    return op(image, queries, *tables, wrap).view(*batch, queries.shape[1], 4, KINDS)
 
 
 def surface_likelihood(

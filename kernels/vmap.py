@@ -1,4 +1,8 @@
-"""`torch.vmap` over an op: where all of its tensors begin with a batch dimension one more is folded into it."""
+"""`torch.vmap` over custom ops.
+
+The tensors of most ops begin with a batch dimension, and `fold_into_batch` folds the mapped dimension into it. Other
+ops cannot be mapped over, and `refuse` says so.
+"""
 
 from typing import Any
 
@@ -8,10 +12,10 @@ __all__ = ["fold_into_batch", "refuse"]
 
 
 def fold_into_batch(op: Any) -> None:
-    """Registers the rule for a custom op; without one PyTorch would call it once per element, and warn.
+    """Registers a rule that runs a mapped op once. Without a rule PyTorch runs it once per element, and warns.
 
     Args:
-        op: A `torch.library.custom_op` whose tensors, in and out, all are (B, ...) with one B.
+        op: A `torch.library.custom_op` all of whose tensors, inputs and outputs, are (B, ...) with one B.
     """
 
     def rule(info: Any, in_dims: tuple[int | None, ...], *arguments: Any) -> tuple[Any, Any]:
@@ -35,7 +39,7 @@ def fold_into_batch(op: Any) -> None:
 
 
 def refuse(op: Any, remedy: str) -> None:
-    """Registers a rule that says in one line what to do instead.
+    """Registers a rule that raises NotImplementedError and says what to do instead.
 
     Args:
         op: A `torch.library.custom_op` some of whose tensors have no batch dimension.

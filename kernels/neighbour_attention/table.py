@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import torch
 import torch.nn.functional as F
 
+from kernels.checks import check_devices
 from kernels.neighbour_attention.maths import MOMENTS, ROLLED_FOUR
 from kernels.stencil import grid_of
 
@@ -50,7 +51,7 @@ def project_pixels(
         heads: Number of heads; it divides C.
 
     Raises:
-        ValueError: If a shape or `heads` does not fit.
+        ValueError: If a shape, device or `heads` does not fit.
     """
     if features.ndim != 4:
         raise ValueError(f"features has shape {tuple(features.shape)}; it should be (B, C, H, W)")
@@ -63,6 +64,7 @@ def project_pixels(
         raise ValueError(f"qkv_weight has shape {tuple(qkv_weight.shape)}; it should be {(3 * channels, channels)}")
     if heads < 1 or channels % heads:
         raise ValueError(f"heads is {heads}; it should divide the {channels} channels")
+    check_devices(features=features, position=position[0], norm=norm[0], qkv_weight=qkv_weight)
     with torch.autocast(features.device.type, enabled=False):  # a variance wants more digits than bfloat16 has
         z = features.to(position[0].dtype).movedim(1, 3) + position[1]
         mean = z.mean(-1, keepdim=True)

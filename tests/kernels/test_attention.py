@@ -72,7 +72,7 @@ def test_no_queries_and_strided_input(device):
     [
         (torch.ones(7, 3, 6), 1, r"qkv has shape \(7, 3, 6\)"),
         (torch.ones(7, 4, 6), 4, "multiple of the 4 heads"),
-        (torch.ones(7, 4, 6), 0, "0 heads"),
+        (torch.ones(7, 4, 6), 0, "heads is 0; it should be at least 1"),
         (torch.ones(7, 4, 6).long(), 1, "qkv is torch.int64"),
     ],
 )

@@ -1,4 +1,7 @@
-"""What every differentiable op promises besides its values: a case is a line in `CASES`."""
+"""What every op promises besides its values.
+
+A differentiable op is an entry in `CASES`, any other op one in `OTHERS`.
+"""
 
 import shutil
 import threading
@@ -8,15 +11,24 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from torch._subclasses import FakeTensor, FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from kernels import (
     area_blend,
     attend_neighbours,
+    fused_decode,
     gather_blend,
     gather_neighbours,
     neighbour_attention,
+    plane_prior,
     project_pixels,
+    surface_hypotheses,
+    surface_likelihood,
+    surface_median,
 )
+from kernels.checks import check_devices
+from kernels.neighbour_attention import DecoderWeights
 
 BATCH, COUNT = 2, 4500  # enough queries for every launch to be split over cores, and not a multiple of 4
 
@@ -30,25 +42,35 @@ class Case(NamedTuple):
 
     call: Callable[..., torch.Tensor]
     tensors: tuple[str, ...]
-    leaves: tuple[str, ...]
+    leaves: tuple[str, ...] = ()
     """Those that get gradients."""
-    half: str
+    half: str = ""
     """The one that a network under autocast hands over in half precision; none where the op itself goes by autocast."""
-    half_out: torch.dtype
+    half_out: torch.dtype = torch.float32
     """What the op then returns, beside bfloat16."""
-    saved: tuple[str, ...]
+    saved: tuple[str, ...] = ()
     """Those that the backward pass reads, so that nobody may have changed them."""
     vmap: bool = True
     """Whether `torch.vmap` goes through it."""
 
 
-def whole_step(heads, features, queries, qkv_weight):
-    """`neighbour_attention` with the parameters that gradients need not be asked for made up."""
+def project(heads, features, qkv_weight):
+    """`project_pixels` with the parameters that gradients need not be asked for made up."""
     repeated = features.repeat_interleave(4, 1)  # 64 channels
-    ones, zeros = features.new_ones(64).float(), features.new_zeros(64).float()
-    position = torch.stack((ones, -ones), 1) * torch.linspace(-1, 1, 64, device=features.device).unsqueeze(1)
-    projected = project_pixels(repeated, (position, zeros), (ones, zeros), qkv_weight, heads)
-    return neighbour_attention(projected, queries, (qkv_weight[:64], zeros))
+    ones, zeros = qkv_weight.new_ones(64).float(), qkv_weight.new_zeros(64).float()
+    position = torch.stack((ones, -ones), 1) * torch.linspace(-1, 1, 64, device=qkv_weight.device).unsqueeze(1)
+    return project_pixels(repeated, (position, zeros), (ones, zeros), qkv_weight, heads)
+
+
+def whole_step(heads, features, queries, qkv_weight):
+    projected = project(heads, features, qkv_weight)
+    return neighbour_attention(projected, queries, (qkv_weight[:64], qkv_weight.new_zeros(64)))
+
+
+def whole_decoder(features, queries, qkv_weight, image, scores):
+    norm, matrix = (qkv_weight[0], qkv_weight[1]), (qkv_weight[:64], qkv_weight[2])
+    weights = DecoderWeights(matrix, norm, matrix, matrix, norm, (qkv_weight[:1], qkv_weight[0, :1]))
+    return fused_decode(project(8, features, qkv_weight), image, queries, weights, "bilinear", added=scores)
 
 
 CASES = {
@@ -104,8 +126,22 @@ CASES = {
     ),
 }
 
+RAYS = ("image", "queries", "elevations", "azimuths")
+OTHERS = {
+    "plane_prior": Case(plane_prior, ("image", "queries")),
+    "fused_decode": Case(whole_decoder, ("features", "queries", "qkv_weight", "image", "scores")),
+    "surface_hypotheses": Case(surface_hypotheses, RAYS),
+    "surface_likelihood": Case(
+        lambda *tensors: surface_likelihood(*tensors, 100.0)[0],
+        (*RAYS, "hypothesis_scores", "scores", "targets"),
+        leaves=("hypothesis_scores", "scores"),
+    ),
+    "surface_median": Case(lambda *tensors: surface_median(*tensors)[0], (*RAYS, "hypothesis_scores", "scores")),
+}
+EVERY = CASES | OTHERS
+
 PER_PIXEL = ("features", "image")
-WITHOUT_BATCH = ("qkv_weight",)
+WITHOUT_BATCH = ("qkv_weight", "elevations", "azimuths")
 
 cuda_only = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
@@ -113,6 +149,13 @@ cuda_only = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CU
 @pytest.fixture(params=CASES)
 def case(request):
     return CASES[request.param]
+
+
+@pytest.fixture(params=EVERY)
+def every_case(request, device):
+    if request.param == "fused_decode" and device.type == "cuda":
+        pytest.skip("serves CPUs only")
+    return EVERY[request.param]
 
 
 @pytest.fixture
@@ -133,6 +176,10 @@ def draw(case, device, seed=0):
         "values": torch.randn(BATCH, COUNT, 4, generator=generator),
         "qkv": torch.randn(BATCH, COUNT, 4, 24, generator=generator),
         "qkv_weight": torch.randn(192, 64, generator=generator) / 8,
+        "hypothesis_scores": torch.randn(BATCH, COUNT, 4, 9, generator=generator),
+        "targets": torch.rand(BATCH, COUNT, generator=generator) * 20 + 2,
+        "elevations": torch.linspace(-0.3, 0.2, 6),
+        "azimuths": torch.linspace(-3, 3, 16),
     }
     return {name: every[name].to(device) for name in case.tensors}
 
@@ -146,7 +193,8 @@ def run(case, tensors, call=None):
     """The op's result and its gradients to the leaves."""
     tensors = {name: t.detach().requires_grad_(name in case.leaves) for name, t in tensors.items()}
     result = (call or case.call)(*tensors.values())
-    return [result.detach(), *torch.autograd.grad(loss_of(result), [tensors[name] for name in case.leaves])]
+    leaves = [tensors[name] for name in case.leaves]
+    return [result.detach(), *(torch.autograd.grad(loss_of(result), leaves) if leaves else ())]
 
 
 def assert_same(ours, expected):
@@ -260,6 +308,61 @@ def test_without_queries(case, device):
     assert result.shape[:2] == (BATCH, 0)
     for name, gradient in zip(case.leaves, gradients, strict=True):
         assert torch.equal(gradient, torch.zeros_like(tensors[name]))
+
+
+def test_an_empty_batch(every_case, device):
+    tensors = {n: t if n in WITHOUT_BATCH else t[:0] for n, t in draw(every_case, device).items()}
+    result, *gradients = run(every_case, tensors)
+    assert result.shape[:2] == (0, COUNT)
+    for name, gradient in zip(every_case.leaves, gradients, strict=True):
+        assert torch.equal(gradient, torch.zeros_like(tensors[name]))
+
+
+def test_tensors_on_two_devices_are_refused(every_case, device):
+    tensors = draw(every_case, device)
+    for name in every_case.tensors if len(every_case.tensors) > 1 else ():
+        with pytest.raises(ValueError, match=r"(is|be) on meta"):
+            every_case.call(*(tensors | {name: tensors[name].to("meta")}).values())
+
+
+def test_the_index_of_a_device_counts():
+    with FakeTensorMode() as mode:
+        first, second = (FakeTensor(mode, torch.empty(1, device="meta"), torch.device("cuda", n)) for n in range(2))
+    check_devices(image=second, queries=second)
+    with pytest.raises(ValueError, match="queries is on cuda:1; it should be on cuda:0, where image is"):
+        check_devices(image=first, queries=second)
+
+
+def test_fake_tensors_foretell_shapes_dtypes_and_devices(every_case, device):
+    tensors = draw(every_case, device)
+    expected = run(every_case, tensors)
+    with FakeTensorMode() as mode:
+        results = run(every_case, {name: mode.from_tensor(tensor) for name, tensor in tensors.items()})
+    for ours, real in zip(results, expected, strict=True):
+        assert isinstance(ours, FakeTensor)
+        assert (ours.shape, ours.stride(), ours.dtype, ours.device) == (
+            real.shape,
+            real.stride(),
+            real.dtype,
+            real.device,
+        )
+
+
+def test_every_op_is_called_by_a_case(device):
+    if device.type == "cuda":
+        pytest.skip("the same as on a CPU")
+    called = set()
+
+    class Record(TorchDispatchMode):
+        def __torch_dispatch__(self, function, types, arguments=(), options=None):
+            called.add(function.name())
+            return function(*arguments, **(options or {}))
+
+    with Record():
+        for case in EVERY.values():
+            tensors = draw(case, device)
+            run(case, {n: t if n in (*PER_PIXEL, *WITHOUT_BATCH) else t[:, :5] for n, t in tensors.items()})
+    assert {name for name in torch._C._dispatch_get_all_op_names() if name.startswith("kernels::")} <= called
 
 
 def test_several_python_threads_at_once(case, device):

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -136,6 +138,16 @@ def test_backward_twice_gives_the_same_gradient_bit_for_bit(device):
     gathered, _ = gather_neighbours(features, queries)
     first, second = (torch.autograd.grad(gathered.sin().sum(), features, retain_graph=True)[0] for _ in range(2))
     assert torch.equal(first, second)
+
+
+@pytest.mark.parametrize("wrap", [True, False])
+def test_nan_and_infinite_queries_select_the_pixels_that_the_reference_selects(wrap, device):
+    features = torch.arange(5 * 7.0, device=device).view(1, 5, 7)
+    odd = torch.tensor([math.nan, math.inf, -math.inf, 1e30, -1e30, 2.5], device=device)
+    queries = torch.cartesian_prod(odd, odd)
+    ours, reference = (gather_neighbours(features, queries, wrap, backend=backend) for backend in ("warp", "torch"))
+    assert torch.equal(ours[0], reference[0])
+    torch.testing.assert_close(ours[1], reference[1], equal_nan=True)
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -170,6 +172,24 @@ def test_nan_stays_with_the_queries_it_concerns(device):
     assert blended.isnan().sum() == 1
 
 
+@pytest.mark.parametrize("prior", PRIORS)
+@pytest.mark.parametrize("wrap", [True, False])
+def test_nan_queries_and_nan_ranges_give_what_the_reference_gives(prior, wrap, device):
+    image, queries, scores = draw(8, 16, device)
+    queries[0, ::7, 0] = math.nan
+    queries[0, ::5, 1] = math.nan
+    queries[1, ::7] = math.inf
+    image[1, 3, 4] = math.nan
+    results = [
+        gather_blend(image, queries, scores, prior, wrap, area_floor=1e-3, return_weights=True, backend=backend)
+        for backend in ("warp", "torch")
+    ]
+    for ours, reference in zip(*results, strict=True):
+        torch.testing.assert_close(ours, reference, rtol=RELATIVE, atol=METRES, equal_nan=True)
+    assert results[0][0].isnan().any()
+    assert results[0][0].isfinite().any()
+
+
 def test_batches_broadcast(device):
     image, queries, scores = draw(5, 6, device, batch=(3, 1))
     queries, scores = queries[:1, 0], scores[0].expand(4, -1, -1)
@@ -240,13 +260,18 @@ def bad_arguments():
         "image is torch.int64": (image.long(), queries, scores, {}),
         "image is list": ([[1.0]], queries, scores, {}),
         "image is torch.bfloat16": (image.bfloat16(), queries, scores.bfloat16(), {}),
-        "scores is torch.float16, image torch.float64": (image.double(), queries, scores.half(), {}),
+        "scores is torch.float16; it should be torch.float64, as image is": (
+            image.double(),
+            queries,
+            scores.half(),
+            {},
+        ),
         r"image has shape \(0, 5\)": (image[:0], queries, scores, {}),
         r"queries has shape \(7, 3\)": (image, torch.ones(7, 3), scores, {}),
         "queries is torch.int64": (image, queries.long(), scores, {}),
         r"scores has shape \(6, 4\)": (image, queries, scores[:6], {}),
         r"scores has shape \(7, 3\)": (image, queries, scores[:, :3], {}),
-        "scores is torch.float64, image torch.float32": (image, queries, scores.double(), {}),
+        "scores is torch.float64; it should be torch.float32, as image is": (image, queries, scores.double(), {}),
         "do not broadcast": (image.expand(3, 4, 5), queries.expand(2, 7, 2), scores, {}),
     }
 

@@ -1,6 +1,8 @@
 """The ways in which a launch reaches the cores: all must give what one thread gives."""
 
 import os
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -8,6 +10,9 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from kernels import Mesh, gather_blend
+from kernels.launch import launch
+from kernels.plane_prior import _kernels as _plane_prior
+from kernels.stencil import grid_of
 
 QUERIES = 20_000  # enough to be split over cores
 
@@ -25,6 +30,34 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_a_module_is_compiled_once(cores, tmp_path):
+    script = (
+        "import sys, torch, warp\n"
+        f"torch.set_num_threads({cores})\n"
+        "from kernels import Mesh\n"
+        "mesh = Mesh(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), torch.tensor([[0, 1, 2]]))\n"
+        "up = torch.tensor([0.0, 0, 1]).expand(5000, 3)\n"
+        "assert mesh.cast(torch.tensor([0.2, 0.2, -1.0]), up, 9.0).range.eq(1).all()\n"
+    )
+    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", script], env=environment, check=True, timeout=300)
+    assert [name.split("_")[1] for name in kernel_folders(tmp_path)] == ["kernels.rays.mesh"]
+
+
+def kernel_folders(cache):
+    return sorted(folder.name for folder in cache.rglob("wp_*") if folder.is_dir())
+
+
+@pytest.mark.parametrize("moved", ["image", "queries", "prior_out"])
+def test_tensors_on_two_devices_are_named_before_a_kernel_sees_them(moved):
+    tensors = {"image": torch.ones(1, 4, 5), "queries": torch.ones(1, 7, 2), "prior_out": torch.empty(1, 7, 4)}
+    tensors[moved] = tensors[moved].to("meta")
+    image, queries, prior = tensors.values()
+    with pytest.raises(ValueError, match=rf"(?=.*{moved})(?=.* is on meta|.*be on meta)"):
+        launch(_plane_prior[torch.float32], 7, [image, queries, 4.0, 0.0, grid_of(4, 5, True)], [prior])
 
 
 def test_any_number_of_cores_gives_the_same(one_thread):

@@ -99,6 +99,22 @@ def test_columns_wrap_at_the_seam(device):
     torch.testing.assert_close(plane_prior(image, queries).exp(), plane_prior(image, turned).exp(), rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize("floor", [0.0, 1e-3])
+def test_nan_pixels_and_nan_queries_give_nan_as_in_the_reference(floor, device):
+    image, queries = draw(device)
+    image[0, 2, 3] = math.nan
+    queries[1, ::7, 0] = math.nan
+    queries[1, ::5, 1] = math.nan
+    ours, reference = (plane_prior(image, queries, area_floor=floor, backend=backend) for backend in ("warp", "torch"))
+    torch.testing.assert_close(ours.exp(), reference.exp(), rtol=0, atol=TOLERANCE[torch.float32], equal_nan=True)
+    ranges, _ = gather_neighbours(image.unsqueeze(1), queries)
+    beside_nan = ranges.squeeze(-1).isnan()
+    assert beside_nan.any()
+    assert ours[beside_nan].isnan().all()
+    assert ours[queries.isnan().any(-1)].isnan().any(-1).all()
+    assert ours.isfinite().any()
+
+
 def test_opcheck_compile_and_vmap(device):
     image, queries = draw(device, count=9)
     torch.library.opcheck(_plane_prior, (image, queries, 4.0, 1e-3, True))

@@ -1,10 +1,13 @@
 import math
+import threading
+import time
 
 import numpy as np
 import pytest
 import torch
 
 from kernels import Mesh
+from kernels.rays import mesh as mesh_module
 
 # float32 of coordinates up to some tens of metres, through a few operations.
 METRES = 1e-4
@@ -175,6 +178,42 @@ def test_a_mesh_may_go_before_its_rays_have_come_home(device):
         assert torch.equal(dropped, expected)
 
 
+def test_a_range_may_be_any_real_number(device):
+    mesh = Mesh(*plane(), device)
+    down = torch.tensor([0.0, 0.0, -1.0], device=device)
+    for limit in (9, 9.0, np.float32(9), np.float64(9), np.int64(9), math.inf):
+        assert mesh.cast(torch.tensor([0.0, 0.0, 2.0], device=device), down, limit).range == 2
+        assert mesh.project(torch.eye(4), torch.zeros(1), torch.zeros(1), limit).shape == (1, 1)
+
+
+@pytest.mark.parametrize("part", ["_build_tree", "cluster_triangles"])
+def test_threads_that_use_a_new_mesh_together_make_its_tree_once(part, monkeypatch):
+    made = []
+    module = mesh_module if part == "cluster_triangles" else Mesh
+    make = getattr(module, part)
+
+    def slow(*arguments):
+        made.append(part)
+        time.sleep(0.2)
+        return make(*arguments)
+
+    monkeypatch.setattr(module, part, slow)
+    mesh = Mesh(*plane())
+    origin, down = torch.tensor([0.0, 0.0, 2.0]), torch.tensor([0.0, 0.0, -1.0])
+    used = []
+
+    def use():
+        used.append((mesh.cast(origin, down, 5.0).range.item(), mesh.projects_faster(origin, 10, 5.0)))
+
+    threads = [threading.Thread(target=use) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert used == [(2.0, False)] * 4
+    assert made == [part]
+
+
 def bad_meshes():
     vertices, triangles = plane()
     torn = vertices.clone()
@@ -199,7 +238,7 @@ def test_bad_meshes_are_refused(message):
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
 def test_a_device_that_is_not_there_is_named():
-    with pytest.raises(ValueError, match="device is 'cuda', which is not there"):
+    with pytest.raises(ValueError, match="device is 'cuda'; it should be a device of this machine"):
         Mesh(*plane(), device="cuda")
 
 
@@ -215,7 +254,10 @@ def test_a_device_that_is_not_there_is_named():
         (torch.zeros(3), torch.ones(3), None, "max_range is None"),
         (torch.zeros(3), torch.ones(3), 0.0, r"max_range is 0\.0"),
         (torch.zeros(3), torch.ones(3), math.nan, "max_range is nan"),
+        (torch.zeros(3), torch.ones(3), "9", "max_range is 9"),
         ([0.0, 0.0, 0.0], torch.ones(3), 5.0, "origins is list"),
+        (torch.zeros(3, device="meta"), torch.ones(3), 5.0, "origins is on meta; it should be on cpu"),
+        (torch.zeros(3), torch.ones(3, device="meta"), 5.0, "directions is on meta; it should be on cpu"),
     ],
 )
 def test_bad_rays_are_refused(origins, directions, max_range, message):

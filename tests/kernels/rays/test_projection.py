@@ -93,6 +93,19 @@ def test_any_number_of_cores_gives_the_same(device):
         ((torch.eye(4), torch.zeros(0), torch.zeros(2), 9.0), r"elevations has shape \(0,\)"),
         ((torch.eye(4), torch.zeros(2), torch.tensor([math.nan]), 9.0), "azimuths has shape"),
         ((torch.eye(4), torch.zeros(2), torch.zeros(2), 0.0), "max_range is 0.0"),
+        (
+            (torch.zeros(4, 4), torch.zeros(2), torch.zeros(1), 9.0),
+            "pose is .*it should be a rotation and a translation",
+        ),
+        ((2 * torch.eye(4), torch.zeros(2), torch.zeros(1), 9.0), "pose is"),
+        ((torch.diag(torch.tensor([1.0, 1, -1, 1])), torch.zeros(2), torch.zeros(1), 9.0), "pose is"),
+        ((torch.ones(4, 4) + torch.eye(4), torch.zeros(2), torch.zeros(1), 9.0), "pose is"),
+        ((torch.eye(4), torch.tensor([1.6]), torch.zeros(1), 9.0), r"elevations reaches 1\.6"),
+        (
+            (torch.eye(4), torch.zeros(2), torch.tensor([0.0, 100.0]), 9.0),
+            r"azimuths has 2 values of 2 from 0\.0 to 100",
+        ),
+        ((torch.eye(4), torch.zeros(2), torch.zeros(2), 9.0), "azimuths has 1 values of 2"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
