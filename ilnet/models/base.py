@@ -207,7 +207,7 @@ class Upsampler:
 
     def _replay(self, image: torch.Tensor) -> torch.Tensor:
         with self._lock:
-            if not self._warm:  # the first frame loads kernels and tries out algorithms, which a recording may not do
+            if not self._warm:  # perhaps the only frame
                 answer = self._answer(image)
                 self._warm = True
                 return answer
@@ -222,8 +222,13 @@ class _Recording:
     def __init__(self, work: Callable[[torch.Tensor], torch.Tensor], image: torch.Tensor):
         self._image = image.clone()
         self._graph = torch.cuda.CUDAGraph()
-        # On a stream of this device, which need not be the current one; other threads may allocate memory meanwhile.
-        stream = torch.cuda.Stream(image.device)
+        # A stream of this device, which need not be the current one.
+        stream, current = torch.cuda.Stream(image.device), torch.cuda.current_stream(image.device)
+        stream.wait_stream(current)
+        with torch.cuda.stream(stream):
+            work(self._image)  # loads kernels and sets up libraries for this thread, which a recording may not do
+        current.wait_stream(stream)
+        # Other threads may allocate memory meanwhile.
         with torch.cuda.graph(self._graph, stream=stream, capture_error_mode="thread_local"):
             self._answer = work(self._image)
         self._free = torch.cuda.Event()

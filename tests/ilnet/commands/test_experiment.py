@@ -21,6 +21,7 @@ def study(tmp_path, monkeypatch, yard, quiet_place):
     def pairs(town, count, output):
         return [tuple(simulate.scan(yard, sensor, pose((3.0, 0.0, 1.8))) for sensor in (PAPER_INPUT, output))] * count
 
+    monkeypatch.setattr(simulate, "best_device", lambda: torch.device("cpu"))  # where the yard is
     monkeypatch.setattr(train.places, "town", lambda *args: place)
     monkeypatch.setattr(evaluate, "town_pairs", pairs)
     monkeypatch.setattr(train, "HELD_OUT", {"town01": 1})

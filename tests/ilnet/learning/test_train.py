@@ -21,6 +21,7 @@ from ilnet.world.simulate import pose
 def quick(monkeypatch, quiet_place):
     """Training in the yard, with a network and batches of a size for tests."""
     place = quiet_place([[3, 0, 0]])
+    monkeypatch.setattr(simulate, "best_device", lambda: torch.device("cpu"))  # where the yard is
     monkeypatch.setattr(train.places, "town", lambda *args: place)
     monkeypatch.setattr(train, "HELD_OUT", {"town01": 1})
     monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
@@ -168,7 +169,7 @@ def test_the_head_of_a_network_with_a_prior_gets_a_gradient(yard):
 
 def train_in_yard(out, processes, *arguments):
     out.mkdir()
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1", "CUDA_VISIBLE_DEVICES": ""}
     launcher = ["-m", "torch.distributed.run", f"--nproc-per-node={processes}", "--master-port=0", "--standalone"]
     script = Path(__file__).with_name("train_in_yard.py")
     command = [sys.executable, *(launcher if processes > 1 else []), str(script), str(out), *arguments]

@@ -395,12 +395,14 @@ def graphs(monkeypatch):
 
     state = types.SimpleNamespace(graphs=[], replays=0, fails=False)
     make = base._Recording.__init__
-    nothing = types.SimpleNamespace(wait_event=lambda event: None, record_event=lambda event: None)
+    nothing = types.SimpleNamespace(**{f"{verb}_event": lambda event: None for verb in ("wait", "record")})
+    nothing.wait_stream = lambda stream: None
     monkeypatch.setattr(base._Recording, "__init__", remember)
     monkeypatch.setattr(torch.cuda, "CUDAGraph", Graph)
     monkeypatch.setattr(torch.cuda, "graph", record)
     monkeypatch.setattr(torch.cuda, "Event", lambda: None)
-    monkeypatch.setattr(torch.cuda, "Stream", lambda device: None)
+    monkeypatch.setattr(torch.cuda, "Stream", lambda device: nothing)
+    monkeypatch.setattr(torch.cuda, "stream", contextlib.nullcontext)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: nothing)
     return state
 
