@@ -4,13 +4,15 @@ import os
 import subprocess
 import sys
 import threading
+from typing import Any
 
 import pytest
 import torch
+import warp as wp
 from torch.utils.data import DataLoader, Dataset
 
 from kernels import Mesh, gather_blend
-from kernels.launch import launch
+from kernels.launch import concrete, launch
 from kernels.plane_prior import _kernels as _plane_prior
 from kernels.stencil import grid_of
 
@@ -30,6 +32,28 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@wp.kernel(enable_backward=False)
+def _generic_kernel(
+    first: int,
+    stored: wp.array2d[Any],
+    pairs: wp.array[wp.types.vector(2, wp.Scalar)],
+    factor: wp.Float,
+    count: int,
+):
+    stored[0, 0] = stored.dtype()
+
+
+def test_a_concrete_kernel_has_no_generic_type_left():
+    lanes = wp.types.vector(16, wp.bfloat16)
+    kernel = concrete(_generic_kernel, {Any: lanes, wp.Scalar: wp.float64, wp.Float: wp.float32})
+    first, stored, pairs, factor, count = (argument.type for argument in kernel.adj.args)
+    assert (stored.dtype, stored.ndim) == (lanes, 2)
+    assert wp.types.types_equal(pairs.dtype, wp.vec2d)
+    assert pairs.ndim == 1
+    assert (first, factor, count) == (wp.int32, wp.float32, wp.int32)
+    assert not kernel.is_generic
 
 
 @pytest.mark.parametrize("cores", [1, 2])
@@ -68,8 +92,6 @@ def test_any_number_of_cores_gives_the_same(one_thread):
 
 
 def test_a_launch_is_split_over_cores(monkeypatch, one_thread):
-    import warp as wp
-
     used = set()
     original = wp.launch
 
