@@ -2,7 +2,9 @@
 
 import runpy
 import shlex
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -52,6 +54,19 @@ def test_a_step_that_hangs_is_stopped(gpu):
     assert code == 1
     assert "| slow | failed: out of time |" in report
     assert "| late | passed |" in report
+
+
+def test_asked_to_stop_it_ends_its_steps_and_writes_the_report(tmp_path):
+    out = tmp_path / "out"
+    process = subprocess.Popen([sys.executable, SCRIPT, "--out", out, "ops", "bench-ops"], stdout=subprocess.DEVNULL)
+    while not (out / "log.txt").exists():
+        time.sleep(0.1)
+    time.sleep(1)  # in the midst of the first step
+    process.terminate()
+    assert process.wait(timeout=60) == 1
+    report = (out / "report.md").read_text()
+    assert "| ops | failed: exit status" in report
+    assert "| bench-ops | failed: out of time before it began |" in report
 
 
 def test_every_step_names_tests_and_commands_that_exist():
