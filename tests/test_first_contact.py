@@ -34,7 +34,7 @@ def gpu(tmp_path, monkeypatch):
 def test_a_step_that_fails_does_not_stop_the_others(gpu, tmp_path):
     steps = {
         "bad": ("print('before'); raise SystemExit(3)", ""),
-        "good": ("print('all is well')", "pytest"),
+        "good": ("print('1 of 2\\r2 of 2: all is well')", "pytest"),
         "poor": ("", "pytest no_such_package no-such-program"),
     }
     code, report = gpu(steps)
@@ -44,7 +44,8 @@ def test_a_step_that_fails_does_not_stop_the_others(gpu, tmp_path):
     assert results["bad"] == "failed: exit status 3"
     assert results["good"] == "passed"
     assert results["poor"] == "skipped: needs no_such_package, no-such-program"
-    assert "all is well" in report
+    assert "2 of 2: all is well" in report
+    assert "1 of 2" not in report  # of a progress bar the end
     assert "before" in (tmp_path / "out" / "log.txt").read_text()
     assert gpu(steps, "good", "poor")[0] == 0
 
