@@ -1,6 +1,6 @@
-"""A range image with its sensor, and its points.
+"""A scan: a range image with its sensor, and its points.
 
-A range of 0 means no return. Points are in the sensor frame of `ilnet.sensor`.
+A range of 0 means no return. Points are in the sensor frame, see `ilnet.sensor`.
 """
 
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ class Scan:
     """A range image and the sensor that measured it.
 
     Args:
-        ranges: (H, W) [m], finite and >= 0; 0 = no return. Stored as float32.
-        sensor: its `shape` is (H, W).
-        intensity: (H, W), how strong each return is, from 0 to 1; None where nobody measured it. Stored as float32 on
-            the device of `ranges`, and as 0 where there is no return.
+        ranges: (H, W) [m], finite and >= 0; 0 is no return. They are stored as float32.
+        sensor: The sensor that measured them, of shape (H, W).
+        intensity: (H, W) strength of each return, from 0 to 1; None where it was not measured. It is stored as float32
+            on the device of `ranges`, and as 0 where there is no return.
 
     Raises:
-        ValueError: where the shapes differ, a range is NaN, infinite or negative, or an intensity is not in [0, 1].
+        ValueError: If the shapes differ, a range is NaN, infinite or negative, or an intensity is not in [0, 1].
     """
 
     ranges: torch.Tensor
@@ -35,7 +35,7 @@ class Scan:
         ranges = real_tensor("ranges", self.ranges).float()
         if tuple(ranges.shape) != self.sensor.shape:
             raise ValueError(
-                f"ranges has shape {tuple(ranges.shape)}, but its sensor is {self.sensor}: they must agree"
+                f"ranges has shape {tuple(ranges.shape)}; it should be {self.sensor.shape}, the shape of {self.sensor}"
             )
         bad = {
             "NaN": ranges.isnan(),
@@ -45,7 +45,7 @@ class Scan:
         counts = [f"{int(mask.sum())} {kind}" for kind, mask in bad.items() if mask.any()]
         if counts:
             raise ValueError(
-                f"ranges must be finite and >= 0, got {', '.join(counts)} of {ranges.numel()} values: "
+                f"ranges has {', '.join(counts)} of {ranges.numel()} values; all should be finite and >= 0: "
                 "store 0 where nothing came back"
             )
         object.__setattr__(self, "ranges", ranges)
@@ -54,12 +54,12 @@ class Scan:
         intensity = real_tensor("intensity", self.intensity).to(ranges)
         if intensity.shape != ranges.shape:
             raise ValueError(
-                f"intensity has shape {tuple(intensity.shape)}, but ranges {tuple(ranges.shape)}: they must agree"
+                f"intensity has shape {tuple(intensity.shape)}; it should be {tuple(ranges.shape)}, as ranges"
             )
         outside = ~((intensity >= 0) & (intensity <= 1))  # NaN too
         if outside.any():
             raise ValueError(
-                f"intensity must lie from 0 to 1, got {int(outside.sum())} others of {outside.numel()} values: "
+                f"intensity has {int(outside.sum())} of {outside.numel()} values outside 0 to 1; "
                 "divide it by the largest that the sensor reports"
             )
         object.__setattr__(self, "intensity", intensity.where(ranges > 0, 0.0))
@@ -70,22 +70,22 @@ class Scan:
         return Scan(self.ranges.to(device), self.sensor, intensity)
 
     def points(self) -> torch.Tensor:
-        """Return the returns as points (N, 3) float32 [m], sensor frame, row by row."""
+        """Returns the points of all returns, (N, 3) float32 [m], in the sensor frame, row by row."""
         directions = self.sensor.directions().to(self.ranges.device)
         measured = self.ranges > 0
         return directions[measured] * self.ranges[measured, None]
 
     def filled(self, norm_range: float = 0.0) -> torch.Tensor:
-        """Return what a network sees, (H, W) [m]: no return and ranges beyond `max_range` become `norm_range`.
+        """Returns what a network sees, (H, W) [m]: no return and ranges beyond `max_range` become `norm_range`.
 
         Args:
-            norm_range: what the network was trained with [m]; the larger of this and the sensor's is filled in.
+            norm_range: The range that the network was trained with [m]; the sensor's is taken where it is larger.
         """
         unseen = (self.ranges == 0) | (self.ranges > self.sensor.max_range)
         return self.ranges.masked_fill(unseen, max(norm_range, self.sensor.norm_range))
 
     def decimate(self, rows: int | None = None, columns: int | None = None) -> "Scan":
-        """Return the scan of only some of the beams and columns; see `Sensor.decimation`."""
+        """Returns the scan of only some beams and columns; see `Sensor.decimation`."""
         indices = self.sensor.decimation(rows, columns)
         row_index, column_index = (torch.from_numpy(index).to(self.ranges.device) for index in indices)
         intensity = None if self.intensity is None else self.intensity[row_index][:, column_index]
@@ -93,21 +93,21 @@ class Scan:
 
     @classmethod
     def from_points(cls, points: torch.Tensor | np.ndarray, sensor: Sensor) -> "Scan":
-        """Return the range image of a point cloud.
+        """Returns the range image of a point cloud.
 
-        Each point goes to its nearest pixel; where several meet, the nearest to the sensor stays. Points that are out
-        of view, not finite or at the origin are dropped.
+        Each point goes to its nearest pixel. Of several points in one pixel, the nearest to the sensor stays. Points
+        that are out of view, not finite or at the origin are dropped.
 
         Args:
-            points: (N, 3 or more) [m], sensor frame; columns after x, y, z are ignored.
-            sensor: the sensor that saw them.
+            points: (N, 3 or more) [m], in the sensor frame; columns after x, y, z are ignored.
+            sensor: The sensor that measured them.
 
         Raises:
-            ValueError: where `points` has another shape, or no point is in view.
+            ValueError: If `points` has another shape, or no point is in view.
         """
         points = real_tensor("points", points)
         if points.ndim != 2 or points.shape[1] < 3:
-            raise ValueError(f"points must have shape (N, 3 or more), got {tuple(points.shape)}")
+            raise ValueError(f"points has shape {tuple(points.shape)}; it should be (N, 3 or more)")
         xyz = points[:, :3].double()
         distance = xyz.norm(dim=1)
         usable = distance.isfinite() & (distance > 0)
@@ -133,13 +133,13 @@ Pair = tuple[Scan, Scan]
 
 
 def real_tensor(name: str, value: object) -> torch.Tensor:
-    """Return an array of integers or floats as a tensor, floats in any precision."""
+    """Returns an array of integers or floats as a tensor; `name` is for errors."""
     if isinstance(value, torch.Tensor):
         if value.is_complex() or value.dtype == torch.bool:
-            raise ValueError(f"{name} must be numbers, got dtype {value.dtype}")
+            raise ValueError(f"{name} is of dtype {value.dtype}; it should hold real numbers")
         return value.detach()
     array = np.asarray(value)
     if array.dtype.kind not in "fiu":
-        raise ValueError(f"{name} must be numbers, got dtype {array.dtype}")
-    # A copy: torch knows no foreign byte order, and the array may be read-only.
+        raise ValueError(f"{name} is of dtype {array.dtype}; it should hold real numbers")
+    # A copy: torch does not take a foreign byte order, and the array may be read-only.
     return torch.from_numpy(array.astype(np.float64 if array.dtype.itemsize > 4 else np.float32))

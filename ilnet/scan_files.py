@@ -1,18 +1,18 @@
-"""The files that scans come from and go to.
+"""Scans in files: the formats that are read and written.
 
-A range of 0 means no return. Points are in the sensor frame of `ilnet.sensor`.
+A range of 0 means no return. Points are in the sensor frame, see `ilnet.sensor`.
 
-`read` takes, by suffix:
+`read` goes by the suffix:
 
-- `.npz`: `range` (H, W) [m], `elevation_deg` (H,) of its rows and `column_azimuth_deg` (W,) of its columns. Optional:
-  `min_range`, `max_range`, `norm_range` [m] (else the paper's 2, 80 and 100), `name` and `intensity` (H, W), 0 to 1. A
-  sensor given to `read` goes before all of these but the last.
+- `.npz`: `range` (H, W) [m], `elevation_deg` (H,) of the rows and `column_azimuth_deg` (W,) of the columns. Optional
+  are `min_range`, `max_range` and `norm_range` [m], by default the paper's 2, 80 and 100; `name`; and `intensity`
+  (H, W), 0 to 1. A sensor given to `read` replaces all of these except range and intensity.
 - `.npy`: ranges (H, W) of the sensor's shape, or points (N, 3) to (N, 8) that start with x, y, z. Needs a sensor.
-- `.bin`: KITTI, float32 x, y, z, intensity. The sensor is `hdl-64e` unless given.
+- `.bin`: KITTI's float32 x, y, z, intensity. The sensor is `hdl-64e` by default.
 - `.ply`: vertices with x, y, z; ascii or binary. Needs a sensor.
 - `.pcd`: points with x, y, z; ascii, binary or binary_compressed. Needs a sensor; VIEWPOINT is not applied.
 
-`write` takes `.npz`, `.ply` and `.pcd`. Only `.npz` is read with its intensity.
+`write` makes `.npz`, `.ply` and `.pcd`. Intensity is written to all of them, and read from `.npz` alone.
 """
 
 import os
@@ -31,48 +31,51 @@ __all__ = ["UnknownSensor", "read", "write"]
 
 
 def read(path: str | Path, sensor: Sensor | None = None) -> Scan:
-    """Return the scan in a file; the module's table says what each suffix holds. Nothing in it is ever executed.
+    """Returns the scan in a file; the list above says what each suffix holds. Nothing in a file is ever executed.
 
     Args:
-        path: the file.
-        sensor: its sensor, where the file does not say it or says it wrong.
+        path: The file.
+        sensor: The sensor that measured it; None where the file describes it.
 
     Raises:
-        OSError: where the file is missing, a folder or unreadable.
-        ValueError: where it is damaged, of another kind than its suffix says, lacks its sensor or holds no return.
+        OSError: If the file is missing, a folder or unreadable.
+        ValueError: If it is damaged, of another kind than its suffix says, or holds no return; or if it does not hold
+            the angles of its rays and `sensor` is None: then the cause is an `UnknownSensor`.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder: name one of the files in it")
+        raise IsADirectoryError(f"{path} is a folder; it should be one of the files in it")
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; known are {', '.join(_READERS)}")
+        raise ValueError(f"{path}: its suffix is {path.suffix!r}; it should be one of {', '.join(_READERS)}")
     try:
         scan = reader(path, sensor)
         if not (scan.ranges > 0).any():
             raise ValueError("it holds no return: every range is 0")
     except ValueError as error:
-        # One line whatever a library says.
+        # One line, whatever a library wrote.
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
     return scan
 
 
 def write(path: str | Path, scan: Scan) -> None:
-    """Write a scan: `.npz` whole and without loss, `.ply` (binary, with the range) and `.pcd` (binary) its points.
+    """Writes a scan: to `.npz` as it is, to `.ply` (binary, with the range) and `.pcd` (binary) its points.
 
-    Points carry their intensity where the scan has it.
+    Folders are made as needed. A file of that name is replaced once the new one is complete.
 
-    Folders are created as needed. An earlier file of that name stays untouched unless the new one is complete.
+    Args:
+        path: The file; its suffix says the format.
+        scan: What is written, with its intensity where it has one.
 
     Raises:
-        ValueError: where the suffix is unknown.
+        ValueError: If the suffix is unknown.
     """
     path = Path(path)
     writer = _WRITERS.get(path.suffix.lower())
     if writer is None:
-        raise ValueError(f"{path}: unknown suffix {path.suffix!r}; known are {', '.join(_WRITERS)}")
+        raise ValueError(f"{path}: its suffix is {path.suffix!r}; it should be one of {', '.join(_WRITERS)}")
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
@@ -95,7 +98,7 @@ def _read_npz(path: Path, sensor: Sensor | None) -> Scan:
             found = list(file.files)
             wanted = ("range", "elevation_deg", "column_azimuth_deg", "intensity", *limits)
             arrays = {key: file[key] for key in wanted if key in found}
-    except Exception as error:  # zipfile, zlib and numpy raise a dozen kinds on damaged archives
+    except Exception as error:  # zipfile, zlib and numpy raise many kinds on damaged archives
         raise ValueError(f"it cannot be unpacked: {error}") from error
     needed = ["range"] if sensor else ["range", "elevation_deg", "column_azimuth_deg"]
     missing = [key for key in needed if key not in arrays]
@@ -114,7 +117,7 @@ def _read_npy(path: Path, sensor: Sensor | None) -> Scan:
     try:
         with path.open("rb") as file:
             array = np.lib.format.read_array(file, allow_pickle=False)
-    except Exception as error:  # numpy raises a dozen kinds on damaged files
+    except Exception as error:  # numpy raises many kinds on damaged files
         raise ValueError(f"it is not a whole .npy file of numbers: {error}") from error
     if array.shape == sensor.shape:
         return Scan(real_tensor("ranges", array), sensor)
@@ -130,7 +133,7 @@ def _read_bin(path: Path, sensor: Sensor | None) -> Scan:
     return Scan.from_points(np.frombuffer(data, "<f4").reshape(-1, 4), sensor or preset("hdl-64e"))
 
 
-# A field of a point: its name, its numpy type, how many values it has.
+# A field of a point: its name, its numpy type, its number of values.
 _Field = tuple[str, np.dtype, int]
 
 
@@ -150,7 +153,7 @@ def _read_ply(path: Path, sensor: Sensor | None) -> Scan:
         match words:
             case ["format", layout, *_]:
                 if layout not in orders:
-                    raise ValueError(f"its format {layout!r} is unknown; known are {', '.join(orders)}")
+                    raise ValueError(f"its format is {layout!r}; it should be one of {', '.join(orders)}")
             case ["element", name, number]:
                 elements.append(name)
                 count = int(number) if name == "vertex" else count
@@ -159,7 +162,7 @@ def _read_ply(path: Path, sensor: Sensor | None) -> Scan:
             case ["property", *rest] if elements == ["vertex"]:
                 raise ValueError(f"its vertices have a property {' '.join(rest)!r} that this reader does not know")
     if elements[:1] != ["vertex"]:
-        raise ValueError(f"its first element must be its vertices; its elements are {', '.join(elements) or 'none'}")
+        raise ValueError(f"its elements are {', '.join(elements) or 'none'}; the first should be its vertices")
     unpack = _from_text if layout == "ascii" else _from_records
     return Scan.from_points(unpack(body, fields, count), sensor)
 
@@ -184,7 +187,7 @@ def _read_pcd(path: Path, sensor: Sensor | None) -> Scan:
     unpackers = {"ascii": _from_text, "binary": _from_records, "binary_compressed": _from_compressed}
     layout = " ".join(header["DATA"])
     if layout not in unpackers:
-        raise ValueError(f"its DATA {layout!r} is unknown; known are {', '.join(unpackers)}")
+        raise ValueError(f"its DATA is {layout!r}; it should be one of {', '.join(unpackers)}")
     return Scan.from_points(unpackers[layout](body, fields, count), sensor)
 
 
@@ -201,7 +204,7 @@ def _required(sensor: Sensor | None) -> Sensor:
 
 
 def _header(file: BinaryIO, last: str) -> list[list[str]]:
-    """Return the words of each line up to the one that starts with `last`."""
+    """Returns the words of each line up to the one that starts with `last`."""
     lines = []
     while line := file.readline(4096):
         words = line.decode("ascii", "replace").split()
@@ -213,10 +216,10 @@ def _header(file: BinaryIO, last: str) -> list[list[str]]:
 
 
 def _xyz(fields: list[_Field]) -> list[int]:
-    """Return where x, y and z stand among the fields."""
+    """Returns the numbers of the fields x, y and z."""
     names = [name for name, _, _ in fields]
     if not {"x", "y", "z"} <= set(names):
-        raise ValueError(f"its points need fields x, y and z; they have {', '.join(names) or 'none'}")
+        raise ValueError(f"its fields are {', '.join(names) or 'none'}; x, y and z should be among them")
     return [names.index(axis) for axis in "xyz"]
 
 
@@ -237,8 +240,8 @@ def _from_text(body: bytes, fields: list[_Field], count: int) -> np.ndarray:
 
 
 def _from_records(body: bytes, fields: list[_Field], count: int) -> np.ndarray:
-    """Unpack point after point."""
-    # Numbered, since names may repeat: PCL pads with fields all called "_".
+    """Unpacks points stored one after the other."""
+    # Numbered, since names may repeat: PCL pads with fields that are all called "_".
     record = np.dtype([(str(i), kind, (size,)) for i, (_, kind, size) in enumerate(fields)])
     _check_size(body, count * record.itemsize, count)
     records = np.frombuffer(body, record, count)
@@ -246,7 +249,7 @@ def _from_records(body: bytes, fields: list[_Field], count: int) -> np.ndarray:
 
 
 def _from_compressed(body: bytes, fields: list[_Field], count: int) -> np.ndarray:
-    """Unpack PCD's binary_compressed: two sizes, then LZF of all x, then all y, and so on."""
+    """Unpacks PCD's binary_compressed: two sizes, then LZF of all x, all y, and so on."""
     packed, unpacked = int.from_bytes(body[:4], "little"), int.from_bytes(body[4:8], "little")
     _check_size(body[8:], packed, count)
     sizes = [kind.itemsize * size * count for _, kind, size in fields]
@@ -259,12 +262,12 @@ def _from_compressed(body: bytes, fields: list[_Field], count: int) -> np.ndarra
 
 
 def _stack(columns: list[np.ndarray]) -> np.ndarray:
-    with np.errstate(invalid="ignore"):  # a signalling NaN is no accident worth a warning: such points are dropped
+    with np.errstate(invalid="ignore"):  # no warning about a signalling NaN: such points are dropped
         return np.stack(columns, axis=1, dtype=np.float64)
 
 
 def _lzf(data: bytes, size: int) -> bytes:
-    """Unpack LZF: a control byte below 32 starts a run of literals, others copy from what was unpacked before."""
+    """Unpacks LZF: a control byte below 32 starts a run of literals, others copy from what was unpacked before."""
     out, at = bytearray(), 0
     try:
         while at < len(data) and len(out) <= size:
@@ -280,7 +283,7 @@ def _lzf(data: bytes, size: int) -> bytes:
             distance, at = ((control & 31) << 8) + data[at] + 1, at + 1
             if distance > len(out):
                 raise IndexError
-            # A copy may read what it is writing: then it repeats the last `distance` bytes.
+            # A copy longer than `distance` repeats the last `distance` bytes.
             source = bytes(out[len(out) - distance : len(out) - distance + length])
             out += (source * (length // len(source) + 1))[:length]
     except IndexError:
@@ -307,7 +310,7 @@ def _write_npz(file: BinaryIO, scan: Scan) -> None:
 
 
 def _point_rows(scan: Scan, **images: torch.Tensor | None) -> tuple[list[str], np.ndarray]:
-    """Return the names of the fields of a point, and the points (N, fields): x, y, z, and what images say of them."""
+    """Returns the names of a point's fields, and the points (N, fields): x, y, z and their values in `images`."""
     known = {name: image for name, image in images.items() if image is not None}
     measured = scan.ranges > 0
     rows = torch.cat((scan.points(), *(image[measured, None] for image in known.values())), dim=1)

@@ -1,11 +1,11 @@
-"""A LiDAR as tables: one elevation per row, one azimuth per column, range limits; angles to pixel coordinates and back.
+"""A LiDAR as tables: one elevation per row, one azimuth per column, range limits; angles to pixel coordinates.
 
-This is the one home of the project's frame and angles. Sensor frame: x forward, y left, z up. Azimuth turns
+The project's frame and angles are defined here. In the sensor frame x points forward, y left and z up. Azimuth turns
 counter-clockwise from +x (left is +90 deg), elevation rises from the horizontal:
 
     x = cos(elevation) cos(azimuth),  y = cos(elevation) sin(azimuth),  z = sin(elevation)
 
-Radians and metres everywhere in Python; degrees stand only in files and in the preset literals below.
+Python code holds radians and metres. Degrees appear only in files and in the presets below.
 """
 
 import math
@@ -29,7 +29,7 @@ __all__ = [
 
 
 def angles_to_directions(elevation: torch.Tensor, azimuth: torch.Tensor) -> torch.Tensor:
-    """Return the unit vectors (..., 3) that look along elevations and azimuths [rad] of broadcastable shapes."""
+    """Returns the unit vectors (..., 3) along elevations and azimuths [rad] of broadcastable shapes."""
     x, y, z = torch.broadcast_tensors(
         torch.cos(elevation) * torch.cos(azimuth), torch.cos(elevation) * torch.sin(azimuth), torch.sin(elevation)
     )
@@ -37,7 +37,7 @@ def angles_to_directions(elevation: torch.Tensor, azimuth: torch.Tensor) -> torc
 
 
 def directions_to_angles(directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return elevation and azimuth (...) [rad] of vectors (..., 3) of any length, in the sensor frame."""
+    """Returns elevation and azimuth (...) [rad] of vectors (..., 3) of any length, in the sensor frame."""
     x, y, z = directions.unbind(-1)
     return torch.atan2(z, torch.hypot(x, y)), torch.atan2(y, x)
 
@@ -48,16 +48,16 @@ class Sensor:
 
     Args:
         elevations: (H,) [rad], strictly rising or strictly falling, H >= 2. Spacing may be uneven.
-        azimuths: (W,) [rad], strictly rising or falling once unwrapped, less than a full turn from first to last,
-            W >= 2. Spacing may be uneven. Stored unwrapped: monotonic.
-        min_range: nearest range the sensor measures [m].
-        max_range: farthest range the sensor measures [m].
-        norm_range: what a no-return is filled with before a network sees it [m]; 0 <= min < max < norm, else no
-            return would look like one.
-        name: for messages and files.
+        azimuths: (W,) [rad], strictly rising or strictly falling once unwrapped, less than a full turn from first to
+            last, W >= 2. Spacing may be uneven. The table is stored unwrapped.
+        min_range: Nearest range that the sensor measures [m].
+        max_range: Farthest range that the sensor measures [m].
+        norm_range: Range that stands for no return when a network sees a scan [m]. It lies beyond `max_range`, so that
+            no return differs from every return: 0 <= min < max < norm.
+        name: Used in messages and files.
 
     Raises:
-        ValueError: where a table or a limit breaks these rules.
+        ValueError: If a table or a limit breaks these rules.
     """
 
     elevations: np.ndarray
@@ -71,39 +71,40 @@ class Sensor:
         elevations = _table("elevations", self.elevations)
         if len(elevations) < 2:
             raise ValueError(
-                f"elevations has {len(elevations)} beam(s): a sensor needs at least 2 beams to interpolate between"
+                f"elevations has {len(elevations)} beam(s); it should have at least 2, to interpolate between"
             )
         if not _is_monotonic(elevations):
             raise ValueError(
-                "elevations must strictly rise or strictly fall from row to row: sort the rows by elevation"
+                "elevations is not sorted; it should strictly rise or strictly fall: sort the rows by elevation"
             )
         if np.abs(elevations).max() > math.pi / 2 + 1e-6:
             raise ValueError(
-                f"elevations must lie within +-pi/2 rad, got up to {np.abs(elevations).max():.4g}: are these degrees?"
+                f"elevations reaches {np.abs(elevations).max():.4g} rad; it should lie within +-pi/2: "
+                "are these degrees?"
             )
 
         azimuths = _table("azimuths", self.azimuths)
         if len(azimuths) < 2:
             raise ValueError(
-                f"azimuths has {len(azimuths)} column(s): a sensor needs at least 2 columns to interpolate between"
+                f"azimuths has {len(azimuths)} column(s); it should have at least 2, to interpolate between"
             )
-        # A table that is fine as it stands stays so: columns of a coarse sensor may lie more than half a turn apart.
+        # A valid table is not unwrapped: the columns of a coarse sensor may lie more than half a turn apart.
         if not (_is_monotonic(azimuths) and abs(azimuths[-1] - azimuths[0]) < math.tau):
             azimuths = np.unwrap(azimuths)
             azimuths -= math.tau * np.round((azimuths[0] + azimuths[-1]) / 2 / math.tau)
         if not _is_monotonic(azimuths):
-            raise ValueError("azimuths must strictly rise or strictly fall from column to column, seam aside")
+            raise ValueError("azimuths is not sorted; it should strictly rise or strictly fall, except at the seam")
         span = abs(azimuths[-1] - azimuths[0])
         if span > math.tau * (1 - 1e-9):
             raise ValueError(
-                f"azimuths must span less than 2 pi rad from the first to the last column, got {span:.6g}: "
+                f"azimuths spans {span:.6g} rad; it should span less than 2 pi from the first to the last column: "
                 "are these degrees, or does the last column repeat the first?"
             )
 
         limits = {k: _limit(k, getattr(self, k)) for k in ("min_range", "max_range", "norm_range")}
         if not 0 <= limits["min_range"] < limits["max_range"] < limits["norm_range"]:
-            got = ", ".join(f"{k}={v:g}" for k, v in limits.items())
-            raise ValueError(f"range limits must obey 0 <= min_range < max_range < norm_range, got {got}")
+            found = ", ".join(f"{name} is {value:g}" for name, value in limits.items())
+            raise ValueError(f"{found}; they should be 0 <= min_range < max_range < norm_range")
 
         for field, value in {"elevations": elevations, "azimuths": azimuths, **limits, "name": str(self.name)}.items():
             object.__setattr__(self, field, value)
@@ -119,7 +120,7 @@ class Sensor:
         return hash(self._key())
 
     def _key(self) -> tuple:
-        # To a nanoradian: files hold degrees, and the way there and back may cost the last bit.
+        # To a nanoradian: files hold degrees, and conversion may change the last bit.
         elevations, azimuths = (tuple(table.round(9).tolist()) for table in (self.elevations, self.azimuths))
         return elevations, azimuths, self.min_range, self.max_range, self.norm_range
 
@@ -147,20 +148,20 @@ class Sensor:
         return bool(gap <= 1.5 * np.abs(np.diff(self.azimuths)).max())
 
     def directions(self) -> torch.Tensor:
-        """Return the unit vectors of all rays, (H, W, 3) float32, sensor frame."""
+        """Returns the unit vectors of all rays, (H, W, 3) float32, in the sensor frame."""
         elevations, azimuths = torch.tensor(self.elevations), torch.tensor(self.azimuths)
         return angles_to_directions(elevations[:, None], azimuths[None, :]).float()
 
     def locate(self, elevation: torch.Tensor | float, azimuth: torch.Tensor | float) -> torch.Tensor:
-        """Return the pixel coordinates of laser directions.
+        """Returns the pixel coordinates of laser directions.
 
-        Piecewise linear between the table's entries; beyond the first and last one the end spacing goes on. On a full
-        circle the stretch between column W-1 and column 0 is interpolated too, so a column lies in [0, W); otherwise
-        the turn of the azimuth that is nearest to the middle of the table counts.
+        They are linear between neighbouring entries of a table, and continue with the spacing at its ends. On a full
+        circle the gap between column W-1 and column 0 is interpolated too, so a column lies in [0, W). On a partial
+        circle the azimuth counts in the turn that is nearest to the middle of the table.
 
         Args:
-            elevation: (...) [rad], any float type; broadcasts with `azimuth`.
-            azimuth: (...) [rad], any turn.
+            elevation: (...) [rad], of any float type; broadcasts with `azimuth`.
+            azimuth: (...) [rad], in any turn.
 
         Returns:
             (..., 2) float32 (row, column), on the arguments' device.
@@ -170,7 +171,7 @@ class Sensor:
             v.double() if isinstance(v, torch.Tensor) else torch.tensor(v, dtype=torch.float64, device=device)
             for v in (elevation, azimuth)
         )
-        # Kept apart until the end: a grid costs H + W searches.
+        # Broadcast last: a grid then costs H + W searches.
         row, column = torch.broadcast_tensors(self._row(elevation), self._column(azimuth))
         return torch.stack((row, column), dim=-1)
 
@@ -184,59 +185,58 @@ class Sensor:
             start = (first + last) / 2 - math.pi
             return _fractional_index(table, start + torch.remainder(azimuth - start, math.tau)).float()
         turn = math.copysign(math.tau, last - first)
-        # torch.remainder takes the divisor's sign, so this lies in the table's first turn in either direction.
+        # torch.remainder takes the divisor's sign, so this is in the table's first turn, whether it rises or falls.
         azimuth = first + torch.remainder(azimuth - first, turn)
         column = _fractional_index(np.append(table, first + turn), azimuth).float()
         # Just short of a full turn rounds to W, which is column 0.
         return torch.where(column >= len(table), 0.0, column)
 
     def grid_queries(self, target: "Sensor") -> torch.Tensor:
-        """Return the pixel coordinates in this sensor of all rays of `target`, (H_t, W_t, 2) float32 (row, column)."""
+        """Returns where the rays of `target` lie in this sensor's image: (H_t, W_t, 2) float32 (row, column)."""
         return self.locate(torch.tensor(target.elevations)[:, None], torch.tensor(target.azimuths)[None, :])
 
     def contains(self, queries: torch.Tensor) -> torch.Tensor:
-        """Return (...) bool: which pixel coordinates (..., 2) lie at most half a pixel outside the outermost pixels."""
+        """Returns which pixel coordinates (..., 2) lie in the image or at most half a pixel outside, (...) bool."""
         rows, columns = self.shape
         row, column = queries.unbind(-1)
         inside = (row >= -0.5) & (row <= rows - 0.5)
         return inside if self.wrap else inside & (column >= -0.5) & (column <= columns - 0.5)
 
     def decimation(self, rows: int | None = None, columns: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the row and the column indices that `decimate` keeps.
+        """Returns the numbers of the rows and columns that `decimate` keeps.
 
         Args:
-            rows: how many beams to keep, 2 to H, the outermost two among them; None keeps all.
-            columns: how many columns to keep, evenly from column 0; it must divide W; None keeps all.
+            rows: Number of beams to keep, 2 to H, the outermost two among them; None keeps all.
+            columns: Number of columns to keep, evenly from column 0; a divisor of W; None keeps all.
 
         Returns:
             (rows,) and (columns,) int64.
 
         Raises:
-            ValueError: where `rows` or `columns` does not fit this sensor.
+            ValueError: If `rows` or `columns` does not fit this sensor.
         """
         height, width = self.shape
         rows, columns = height if rows is None else rows, width if columns is None else columns
         if not 2 <= rows <= height:
-            raise ValueError(f"rows must be 2 to {height}, the beams of this sensor, got {rows}")
+            raise ValueError(f"rows is {rows}; it should be 2 to {height}, the number of this sensor's beams")
         if not (2 <= columns <= width and width % columns == 0):
             raise ValueError(
-                f"columns must be at least 2 and divide {width}, the columns of this sensor, got {columns}"
+                f"columns is {columns}; it should be at least 2 and divide {width}, the number of this sensor's columns"
             )
         return np.linspace(0, height - 1, rows).round().astype(np.int64), np.arange(0, width, width // columns)
 
     def decimate(self, rows: int | None = None, columns: int | None = None) -> "Sensor":
-        """Return the nameless sensor of only some of the beams and columns, at their true angles; see `decimation`."""
+        """Returns the sensor of only some beams and columns, at their true angles, without a name; see `decimation`."""
         row_index, column_index = self.decimation(rows, columns)
         return replace(self, elevations=self.elevations[row_index], azimuths=self.azimuths[column_index], name="")
 
     def resize(self, rows: int, columns: int) -> "Sensor":
-        """Return a nameless sensor of `rows` x `columns` evenly spaced rays over the same field of view.
+        """Returns a sensor of `rows` x `columns` evenly spaced rays over the same field of view, without a name.
 
-        The outermost beams stay. A full circle keeps its first column and turns on in even steps; a partial one keeps
-        its first and last column.
+        The outermost beams stay. A full circle keeps its first column; a partial one its first and last.
         """
         if rows < 2 or columns < 2:
-            raise ValueError(f"rows and columns must be at least 2, got {rows} and {columns}")
+            raise ValueError(f"rows and columns are {rows} and {columns}; each should be at least 2")
         first, last = self.azimuths[0], self.azimuths[-1]
         if self.wrap:
             turn = math.copysign(math.tau, last - first)
@@ -266,17 +266,18 @@ def parse_size(size: str) -> tuple[int, int]:
 
 
 def _table(name: str, value: object) -> np.ndarray:
-    """Return a private float64 copy of a table of finite angles."""
+    """Returns a float64 copy of a table of finite angles."""
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().numpy()
     try:
         table = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a 1-D table of angles [rad], got {type(value).__name__}") from None
+        raise ValueError(f"{name} is of type {type(value).__name__}; it should be a list of angles [rad]") from None
     if table.ndim != 1:
-        raise ValueError(f"{name} must be a 1-D table of angles [rad], got shape {table.shape}")
+        raise ValueError(f"{name} has shape {table.shape}; it should be a list of angles [rad]")
     if not np.isfinite(table).all():
-        raise ValueError(f"{name} must be finite, got {np.count_nonzero(~np.isfinite(table))} NaN or infinite entries")
+        bad = np.count_nonzero(~np.isfinite(table))
+        raise ValueError(f"{name} has {bad} NaN or infinite entries; all should be finite")
     return table
 
 
@@ -284,9 +285,9 @@ def _limit(name: str, value: object) -> float:
     try:
         limit = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
-        raise ValueError(f"{name} must be a number of metres, got {value!r}") from None
+        raise ValueError(f"{name} is {value!r}; it should be a number of metres") from None
     if not math.isfinite(limit):
-        raise ValueError(f"{name} must be finite, got {limit}")
+        raise ValueError(f"{name} is {limit}; it should be finite")
     return limit
 
 
@@ -296,7 +297,7 @@ def _is_monotonic(table: np.ndarray) -> bool:
 
 
 def _fractional_index(table: np.ndarray, value: torch.Tensor) -> torch.Tensor:
-    """Return the float64 index of `value` in a monotonic table: linear between the entries and beyond the ends."""
+    """Returns the float64 index of `value` in a monotonic table, linear between the entries and beyond the ends."""
     sign = math.copysign(1.0, table[-1] - table[0])
     ascending = torch.as_tensor(sign * table, device=value.device)
     value = sign * value
@@ -312,31 +313,32 @@ def _from_degrees(
 
 
 def _turn(columns: int, first: float) -> np.ndarray:
-    """Return an even full turn [deg] from `first`, one of the two below; forward is the middle of the image."""
+    """Returns an even full turn [deg] from `first`, -180 or 180, so that forward is the middle of the image."""
     return np.linspace(first, -first, columns, endpoint=False)
 
 
-_UP, _DOWN = -180.0, 180.0  # where azimuths that rise or fall with the column start [deg]
+# Azimuth of the first column [deg], where azimuths rise or fall from column to column.
+_RISING, _FALLING = -180.0, 180.0
 
 PRESETS: dict[str, Sensor] = {
     sensor.name: sensor
     for sensor in (
         # The paper's simulated sensors (row 0 lowest).
         *(
-            _from_degrees(f"paper-{h}x{w}", np.linspace(-15, 15, h), _turn(w, _UP), (2, 80, 100))
+            _from_degrees(f"paper-{h}x{w}", np.linspace(-15, 15, h), _turn(w, _RISING), (2, 80, 100))
             for h, w in ((16, 1024), (64, 1024), (128, 2048), (256, 4096))
         ),
-        # Velodyne: VLP-16 at 10 Hz; HDL-64E (KITTI), an upper block in thirds and a lower one in halves of a degree.
-        _from_degrees("vlp-16", np.arange(-15, 16, 2), _turn(1800, _UP), (0.5, 100, 120)),
+        # Velodyne: VLP-16 at 10 Hz; HDL-64E (KITTI), whose upper beams are 1/3 and lower ones 1/2 degree apart.
+        _from_degrees("vlp-16", np.arange(-15, 16, 2), _turn(1800, _RISING), (0.5, 100, 120)),
         _from_degrees(
             "hdl-64e",
             np.concatenate((2 - np.arange(32) / 3, -8 - 5 / 6 - np.arange(32) / 2)),
-            _turn(2048, _DOWN),
+            _turn(2048, _FALLING),
             (0.9, 120, 150),
         ),
-        # Ouster's nominal fields of view. A real unit has a table of its own in its metadata, often a degree narrower.
+        # Ouster's nominal fields of view. The metadata of a real unit has its own table, often a degree narrower.
         *(
-            _from_degrees(f"{model}-{h}", np.linspace(half, -half, h), _turn(w, _DOWN), limits)
+            _from_degrees(f"{model}-{h}", np.linspace(half, -half, h), _turn(w, _FALLING), limits)
             for model, half, w, limits, beams in (
                 ("os0", 45.0, 1024, (0.5, 100, 120), (32, 128)),
                 ("os1", 22.5, 1024, (0.5, 200, 250), (32, 64, 128)),
@@ -349,9 +351,13 @@ PRESETS: dict[str, Sensor] = {
 
 
 def preset(name: str) -> Sensor:
-    """Return the sensor of that name in `PRESETS`; ValueError lists the names where there is none."""
+    """Returns the sensor of that name in `PRESETS`.
+
+    Raises:
+        ValueError: If there is none.
+    """
     if name not in PRESETS:
-        raise ValueError(f"unknown sensor {name!r}; known are {', '.join(PRESETS)}")
+        raise ValueError(f"sensor is {name!r}; it should be one of {', '.join(PRESETS)}")
     return PRESETS[name]
 
 

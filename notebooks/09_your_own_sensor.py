@@ -45,7 +45,7 @@ import pyvista
 import torch
 
 import ilnet.scan_files
-from ilnet import data, evaluate, metrics, models, places, simulate
+from ilnet import data, evaluate, metrics, models, places, simulate, towns
 from ilnet.course import check, show_scene
 from ilnet.scan import Scan
 from ilnet.sensor import PAPER_INPUT, PRESETS, Sensor, preset
@@ -230,7 +230,7 @@ for scan, marker, colour, label in (
     points = scan.points().cpu()
     strip = points[(points[:, 1].abs() < 1.0) & (points[:, 0] > 0) & (points[:, 0] < 40)]
     axes.plot(strip[:, 0], strip[:, 2], marker, color=colour, markersize=4, label=label, linestyle="", alpha=0.7)
-axes.axhline(-places.SENSOR_HEIGHT, color="black", lw=0.8)
+axes.axhline(-towns.SENSOR_HEIGHT, color="black", lw=0.8)
 axes.set(xlabel="ahead, x [m]", ylabel="height, z [m]", ylim=(-8, 4))
 axes.legend(loc="upper left")
 plt.show()

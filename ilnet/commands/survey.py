@@ -21,7 +21,7 @@ import torch
 from ilnet import scan_files
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
-from ilnet.world import meshes, places, simulate
+from ilnet.world import meshes, places, simulate, towns
 from ilnet.world.effects import Effects
 
 __all__ = ["Entry", "Statistics", "compare", "draw", "ground_height", "records", "statistics", "table"]
@@ -220,15 +220,15 @@ def compare(files: Iterable[Path], mesh_files: Iterable[tuple[Path, Path]], town
     for path in files:
         scan = scan_files.read(path)
         entries.append(Entry(path.stem, path.stem, "measured", [_examined(path, scan)]))
-        sensors.append((path.stem, scan.sensor, ground_height(scan) or places.SENSOR_HEIGHT))
-    sensors = sensors or [(_SENSOR.name, _SENSOR, places.SENSOR_HEIGHT)]
+        sensors.append((path.stem, scan.sensor, ground_height(scan) or towns.SENSOR_HEIGHT))
+    sensors = sensors or [(_SENSOR.name, _SENSOR, towns.SENSOR_HEIGHT)]
     device = simulate.best_device()
     for name in town_names:
-        town = places.town(name, device=device)
-        entries += _simulated(name, "town", town, town.spread(_POSITIONS), sensors)
+        place = places.town(name, device=device)
+        entries += _simulated(name, "town", place, place.spread(_POSITIONS), sensors)
     for path, positions in mesh_files:
-        mesh = places.mesh(path, meshes.read_positions(positions, places.SENSOR_HEIGHT), device)
-        entries += _simulated(path.stem, "mesh", mesh, range(len(mesh.waypoints)), sensors)
+        place = places.mesh(path, meshes.read_positions(positions, towns.SENSOR_HEIGHT), device)
+        entries += _simulated(path.stem, "mesh", place, range(len(place.waypoints)), sensors)
     return sorted(entries, key=lambda entry: [name for name, *_ in sensors].index(entry.sensor))
 
 
@@ -248,7 +248,7 @@ def _simulated(
     for name, sensor, height in sensors:
         found = []
         for number, (waypoint, world) in enumerate(worlds):
-            pose = place.pose(waypoint, height - places.SENSOR_HEIGHT)
+            pose = place.pose(waypoint, height - towns.SENSOR_HEIGHT)
             scan = simulate.scan(world, sensor, pose, NOISE, seed=number)
             found.append(_examined(f"{source}, position {number}", scan))
         entries.append(Entry(name, source, kind, found))

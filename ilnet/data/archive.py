@@ -1,18 +1,18 @@
-"""Many scans on disk, in the Zarr format (version 3), which xarray, TensorStore and others read as well.
+"""Many scans on disk, in the Zarr format (version 3), which xarray, TensorStore and others read too.
 
 An archive is a folder, one Zarr group. For each size, say 64x1024, it holds
 
-- `range_64x1024` (scan, row, column): uint16, 0 = no return, metres when multiplied by its attribute `scale_factor`
-  (a CF attribute: xarray does it by itself). The step is a power of two, 2 mm for a sensor that sees 80 m: float16
-  would lose 3 cm there. The sensor's name and range limits [m] are attributes too.
+- `range_64x1024` (scan, row, column): uint16, 0 = no return; times its attribute `scale_factor` it is a range in metres
+  (a CF attribute, which xarray applies). The step is a power of two, 2 mm for a sensor that sees 80 m, where float16
+  would lose 3 cm. The sensor's name and range limits [m] are attributes too.
 - `elevation_64x1024` (row) and `azimuth_64x1024` (column): float64 rad, in the frame of `ilnet.sensor`;
 
-and for each scan `pose` (scan, 4, 4), from the sensor frame to the world [m], `town`, a number in the group's attribute
-`towns`, and `waypoint`, a number in that town.
+and for each scan `pose` (scan, 4, 4), from the sensor frame to the world [m]; `town`, a number in the group's attribute
+`towns`; and `waypoint`, a number in that town.
 
-A file holds `UNIT` scans of one array; files that belong to the same scans are a unit. Each file appears whole or not
-at all and is never changed, so that several hosts may write units of one archive, or each its own copy of it, to be
-merged by copying the files together.
+A file holds `UNIT` scans of one array; the files of the same scans are a unit. Each file appears whole or not at all
+and is never changed. So several hosts may write units of one archive, or each its own copy of it; copies are merged by
+copying their files together.
 """
 
 import json
@@ -38,24 +38,24 @@ __all__ = ["UNIT", "Archive", "open_archive"]
 
 UNIT = 8
 _FORMAT = 1
-# Of bytes sorted by significance. The checksum tells a damaged file. Within a file each scan is compressed by itself.
+# Bytes are sorted by significance. The checksum shows damage. Within a file each scan is compressed by itself.
 _COMPRESSION = [BloscCodec(cname="zstd", clevel=5, shuffle="shuffle", typesize=2), Crc32cCodec()]
-# How the store names a file that it has not finished.
+# Names that the store gives to unfinished files.
 _UNFINISHED = "*.partial"
 _PER_SCAN = ("town", "waypoint", "pose")
 
 
 class Archive:
-    """Scans of one or several sensors, each at many poses: `len(archive)` of them, of sizes `archive.sizes`.
+    """Scans from many poses, each by one or several sensors. `len(archive)` is the number of poses.
 
     Args:
-        path: Its folder. It may lack scans, which are refused when asked for.
+        path: Its folder. Scans may be missing; reading one raises an error.
 
     Attributes:
         path: Its folder.
-        sizes: Such as "64x1024".
-        sensors: For each size the sensor.
-        towns: Where the scans were taken.
+        sizes: The sizes of its images, such as "64x1024".
+        sensors: The sensor of each size.
+        towns: Names of the places where the scans were taken.
 
     Raises:
         OSError: If there is no archive or it cannot be read.
@@ -76,7 +76,7 @@ class Archive:
             names = [f"{kind}_{size}" for size in self.sizes for kind in ("range", "elevation", "azimuth")]
             self._arrays: dict[str, Any] = {name: group[name] for name in [*names, *_PER_SCAN]}
             self.sensors = {size: self._sensor(size) for size in self.sizes}
-        except Exception as error:  # zarr raises a dozen kinds on damaged files
+        except Exception as error:  # zarr raises many kinds on damaged files
             raise ValueError(f"{path}: not an archive of scans, or damaged: {_line(error)}") from error
 
     def _sensor(self, size: str) -> Sensor:
@@ -107,7 +107,7 @@ class Archive:
         files = _description(scans, sensors, attributes)
         try:
             _refuse_other(path, files)
-            # Last the group's own, by which an archive is known.
+            # The group's own comes last: it makes the folder an archive.
             for name in sorted(files, key=lambda name: name == "zarr.json"):
                 if not (path / name).exists():
                     _put(path / name, files[name])
@@ -134,7 +134,7 @@ class Archive:
         return torch.from_numpy(self._read("pose", number))
 
     def town(self, number: int) -> str:
-        """Returns in which of `towns` a scan was taken; raises as `scan` does."""
+        """Returns the name of the place where a scan was taken, one of `towns`; raises as `scan` does."""
         return self.towns[self._read("town", number)]
 
     def _read(self, name: str, number: int) -> Any:
@@ -147,7 +147,7 @@ class Archive:
             )
         try:
             return self._arrays[name][number]
-        except Exception as error:  # zarr and its codecs raise a dozen kinds on damaged files
+        except Exception as error:  # zarr and its codecs raise many kinds on damaged files
             raise ValueError(
                 f"{file}: damaged ({_line(error)}); delete it and run the command that made the archive again"
             ) from error
@@ -161,14 +161,14 @@ class Archive:
     def write(
         self, unit: int, ranges: Mapping[str, np.ndarray], towns: np.ndarray, waypoints: np.ndarray, poses: np.ndarray
     ) -> None:
-        """Writes a unit; files of it that are there already stay.
+        """Writes a unit; files of it that exist are kept.
 
         Args:
-            unit: Its number; its first scan is `unit * UNIT`.
-            ranges: For each size (n, H, W) uint16, see `quantise`, of all n scans of the unit.
+            unit: Number of the unit; its first scan is `unit * UNIT`.
+            ranges: For each size the images of all n scans of the unit, (n, H, W) uint16, see `quantise`.
             towns: (n,) numbers in `towns`.
-            waypoints: (n,) numbers.
-            poses: (n, 4, 4) float64.
+            waypoints: (n,) numbers of waypoints.
+            poses: (n, 4, 4) float64 transforms from the sensor frame to the world [m].
 
         Raises:
             OSError: If there is no room, or the folder cannot be written.
@@ -179,7 +179,7 @@ class Archive:
         store = LocalStore(self.path)
         try:
             for name, value in values.items():
-                # A file of nothing but fill values counts as much as another: without it the unit would be incomplete.
+                # A file that holds nothing but fill values is written too: without it the unit would be incomplete.
                 if not self._file(name, unit).exists():
                     array = zarr.open_array(store, path=name, mode="r+")
                     array.with_config({"write_empty_chunks": True})[scans] = value
@@ -194,7 +194,7 @@ class Archive:
         return counts.cpu().numpy().astype(np.uint16)
 
     def remove_unfinished(self, units: set[int]) -> None:
-        """Removes what a killed process left of some units; another process may be writing others meanwhile."""
+        """Removes unfinished files of some units; another process may be writing other units meanwhile."""
         for file in self.path.rglob(_UNFINISHED):
             match file.relative_to(self.path).parts:
                 case [_, "c", part, *_] if int(part.split(".")[0]) not in units:
@@ -206,7 +206,7 @@ class Archive:
 
 
 def open_archive(path: str | Path) -> Archive | RangeImageTree:
-    """Opens scans on disk: what `python -m ilnet simulate` made, or the `.rimg` tree of the paper's authors.
+    """Opens scans on disk: an archive, or the `.rimg` tree of the paper's authors.
 
     Raises:
         OSError: If there is neither.
@@ -215,12 +215,12 @@ def open_archive(path: str | Path) -> Archive | RangeImageTree:
     path = Path(path)
     if not path.is_dir():
         what = "is not a folder" if path.exists() else "there is no such folder"
-        raise FileNotFoundError(f"{path}: {what}; give that of an archive or of a tree of .rimg files")
+        raise FileNotFoundError(f"{path}: {what}; it should be that of an archive or of a tree of .rimg files")
     return Archive(path) if (path / "zarr.json").exists() else RangeImageTree(path)
 
 
 def _description(scans: int, sensors: Mapping[str, Sensor], attributes: dict[str, Any]) -> dict[str, bytes]:
-    """The files that tell what an archive will hold: metadata, and the sensors' tables."""
+    """Returns the files that describe an archive's content: metadata, and the sensors' tables."""
     files: dict[str, Buffer] = {}
     store = MemoryStore(files)
     everything = {"format": _FORMAT, "scans": scans, "sizes": list(sensors), **attributes}
@@ -286,9 +286,7 @@ def _put(file: Path, content: bytes) -> None:
 
 
 def _unwritable(path: Path, error: OSError) -> OSError:
-    return OSError(
-        f"{path} cannot be written: {_line(error)}; what is complete there is kept: mend this, then run the same again"
-    )
+    return OSError(f"{path} cannot be written: {_line(error)}; what is complete there is kept: run the same again")
 
 
 def _line(error: BaseException) -> str:

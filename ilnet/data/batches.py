@@ -22,7 +22,7 @@ from kernels import Mesh
 
 __all__ = ["Batch", "ContinuousRays", "StoredImages"]
 
-# Columns at a crop's sides that no query falls into: there the network sees a border no full circle has.
+# No query falls into so many columns at a crop's sides, where the network sees a border that a full circle lacks.
 _MARGIN = 8
 
 
@@ -30,11 +30,11 @@ class Batch(NamedTuple):
     """Crops of scans, and what a laser would have measured between their pixels."""
 
     image: torch.Tensor
-    """(B, H, W) metres, no return filled with `norm_range`."""
+    """(B, H, W) ranges [m], no return filled with `norm_range`."""
     queries: torch.Tensor
     """(B, Q, 2) pixel coordinates."""
     ranges: torch.Tensor
-    """(B, Q) metres along the queries, no return filled with `norm_range`."""
+    """(B, Q) ranges along the queries [m], no return filled with `norm_range`."""
     wrap: bool
     """Whether the images go full circle."""
 
@@ -50,12 +50,12 @@ class ContinuousRays(IterableDataset):
     Args:
         places: Where scans are taken, all on one device; each is drawn equally often.
         sensor: The input sensor.
-        crops: Crops B in a batch.
-        columns: Columns W of a crop.
-        queries: Rays Q per crop.
-        seed: Of the random numbers; seed and number of a batch decide what it holds.
+        crops: Number B of crops in a batch.
+        columns: Number W of columns in a crop.
+        queries: Number Q of rays per crop.
+        seed: Seed of the random numbers; a batch depends on the seed and on its number.
         start: Number of the first batch, for a training that goes on.
-        part: (number, of how many) equal parts of each batch to cast, for training in several processes.
+        part: (i, n): cast part i, counted from 0, of n equal parts of each batch, for training in several processes.
     """
 
     def __init__(
@@ -142,17 +142,17 @@ class StoredImages(IterableDataset):
         archive: See `open_archive`.
         source: Size of the input, such as "16x1024".
         target: Size of the images that the pixels are taken from, such as "128x2048".
-        scans: Scans B in a batch; in the course of an epoch each scan of the archive is drawn once.
-        queries: Pixels Q per scan, all different.
-        seed: Of the random numbers; seed and number of a batch decide what it holds.
+        scans: Number B of scans in a batch; in an epoch each scan of the archive is drawn once.
+        queries: Number Q of pixels per scan, all different.
+        seed: Seed of the random numbers; a batch depends on the seed and on its number.
         start: Number of the first batch, for a training that goes on.
-        part: (number, of how many) equal parts of each batch to read, for training in several processes.
-        sector: Columns of the input to give, from one drawn at random on; all unless told. For models whose columns
-            do not meet at the seam: `wrap` remains the sensor's, since pixels are spaced as on the full circle.
+        part: (i, n): read part i, counted from 0, of n equal parts of each batch, for training in several processes.
+        sector: Number of columns of the input, from a random one on; None for all. For models whose columns do not meet
+            at the seam. `Batch.wrap` remains the sensor's, since pixels are spaced as on the full circle.
 
     Raises:
-        ValueError: If the archive lacks a size, its images hold fewer pixels than `queries`, or their columns are no
-            multiple of those of the input of which a sector is wanted.
+        ValueError: If the archive lacks a size, its images hold fewer pixels than `queries`, or a sector is wanted and
+            the target's number of columns is no multiple of the source's.
     """
 
     def __init__(
@@ -173,10 +173,10 @@ class StoredImages(IterableDataset):
         sensor, dense = archive.sensors[source], archive.sensors[target]
         self.times, rest = divmod(dense.shape[1], sensor.shape[1])
         if sector is not None and rest:
-            raise ValueError(f"columns of {target} are no multiple of those of {source}, of which a sector is wanted")
+            raise ValueError(f"target is {target}; for a sector its columns should be a multiple of those of {source}")
         located = sensor.grid_queries(dense)[:, : None if sector is None else sector * self.times]
         if queries > (pixels := located[..., 0].numel()):
-            raise ValueError(f"queries is {queries}; images of {target} have {pixels} pixels")
+            raise ValueError(f"queries is {queries}; it should be at most {pixels}, the pixels of {target}")
         self.archive, self.source, self.target, self.scans, self.queries = archive, source, target, scans, queries
         self.seed, self.start, self.part, self.wrap = seed, start, _part(scans, part), sensor.wrap
         self.sector, self.located = sector, located.reshape(-1, 2)
@@ -205,12 +205,14 @@ class StoredImages(IterableDataset):
 def _part(batch: int, part: tuple[int, int]) -> slice:
     number, parts = part
     if batch % parts:
-        raise ValueError(f"a batch of {batch} cannot be shared out evenly among {parts} processes")
+        raise ValueError(
+            f"a batch has {batch} scans; their number should be a multiple of {parts}, the number of processes"
+        )
     return slice(number * batch // parts, (number + 1) * batch // parts)
 
 
 def _numbers(start: int) -> Iterator[int]:
-    """Numbers of batches; the workers of a `DataLoader` take turns."""
+    """Returns the numbers of the batches to make; the workers of a `DataLoader` take turns."""
     worker = get_worker_info()
     first, step = (worker.id, worker.num_workers) if worker else (0, 1)
     return itertools.count(start + first, step)

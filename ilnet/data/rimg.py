@@ -1,13 +1,13 @@
 """The `.rimg` files of the paper's authors, in the folders of their download.
 
 `Town01/64_1024/7.rimg` is scan 7 of a town with 64 rows and 1024 columns: two uint64, rows and columns, then float16
-metres, column by column. `lidar_specification.yaml` beside or above the towns tells the field of view [degrees] and the
-range limits [m] of all sizes. Row i looks along elevation v, evenly from `min_v` to `max_v`; column j along an angle h,
-evenly from `min_h` to just short of `max_h`, which their frame counts clockwise from its y axis:
+metres, column by column. `lidar_specification.yaml` beside or above the towns holds the field of view [degrees] and the
+range limits [m] of all sizes. The elevations v of the rows are even from `min_v` to `max_v`. The angles h of the
+columns are even from `min_h` to just short of `max_h`; the authors' frame counts them clockwise from its y axis:
 
     x = sin h cos v · r,  y = cos h cos v · r,  z = sin v · r
 
-In the frame of `ilnet.sensor` that is azimuth = π/2 - h, with which points have the same coordinates in both.
+In the frame of `ilnet.sensor` the azimuth is π/2 - h, so that points have the same coordinates in both.
 """
 
 import math
@@ -30,16 +30,16 @@ _HEADER = 16
 
 
 class RangeImageTree:
-    """The scans of a tree of `.rimg` files, read like an `ilnet.data.archive.Archive`: by town, then by number.
+    """The scans in a tree of `.rimg` files, sorted by town, then by number; read like an `ilnet.data.archive.Archive`.
 
     Args:
-        path: The folder that holds the towns, or that of one town.
+        path: The folder that holds the towns, or the folder of one town.
 
     Attributes:
         path: The folder.
-        sizes: Such as "64x1024", of all towns.
-        sensors: For each size the sensor.
-        towns: The towns' names.
+        sizes: The sizes of all towns, such as "64x1024".
+        sensors: The sensor of each size.
+        towns: Names of the towns.
 
     Raises:
         OSError: If there is no tree, or it lacks its `lidar_specification.yaml`.
@@ -93,7 +93,7 @@ class RangeImageTree:
         return len(self._scans)
 
     def scan(self, number: int, size: str) -> Scan:
-        """Returns a scan; no return, for which some of the authors' tools store a long range, is 0.
+        """Returns a scan; ranges beyond the sensor's maximum, with which the authors' tools store no return, become 0.
 
         Raises:
             IndexError: If there are fewer scans.
@@ -122,11 +122,11 @@ class RangeImageTree:
             raise ValueError(f"{file}: {error}") from None
 
     def pose(self, number: int) -> torch.Tensor:
-        """Raises ValueError: the authors' files do not tell where a scan was taken."""
-        raise ValueError(f"{self.path}: .rimg files hold no poses; only archives made by `simulate` do")
+        """Raises a ValueError: the authors' files do not hold the poses of scans."""
+        raise ValueError(f"{self.path}: .rimg files hold no poses; only archives do")
 
     def town(self, number: int) -> str:
-        """Returns in which of `towns` a scan was taken."""
+        """Returns the name of the town where a scan was taken, one of `towns`."""
         return self._numbered(number)[0]
 
     def _numbered(self, number: int) -> tuple[str, int, Path]:

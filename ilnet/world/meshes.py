@@ -1,7 +1,7 @@
-"""Mesh files, through PyVista's many readers.
+"""Mesh files, read by PyVista.
 
-VTK's readers write to stderr, return empty meshes, or crash the process when a file is damaged. So they run in a
-process of their own, `python -m ilnet.world.meshes FILE OUT.npz`, which may do all that.
+When a file is damaged, VTK's readers write to stderr, return an empty mesh, or crash their process. So they run in a
+process of their own, `python -m ilnet.world.meshes FILE OUT.npz`.
 """
 
 import json
@@ -17,7 +17,7 @@ __all__ = ["read", "read_positions"]
 
 
 def read(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the triangles of any mesh file that PyVista reads; other polygons are cut into triangles.
+    """Reads the triangles of any mesh file that PyVista reads; polygons are cut into triangles.
 
     Args:
         path: The file; metres, z up.
@@ -28,12 +28,12 @@ def read(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 
     Raises:
         FileNotFoundError: If there is no such file.
-        ValueError: If it is not a whole mesh, holds no triangle, or holds NaN.
+        ValueError: If it is not a whole mesh, or holds no triangle or a vertex that is not finite.
     """
     path = Path(path)
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "there is no such file"
-        raise FileNotFoundError(f"{path}: {what}; give the path of a mesh")
+        raise FileNotFoundError(f"{path}: {what}; it should be the path of a mesh")
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "mesh.npz"
         command = [sys.executable, "-m", "ilnet.world.meshes", str(path), str(out)]
@@ -45,21 +45,22 @@ def read(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
             vertices, triangles = arrays["vertices"], arrays["triangles"]
     if len(triangles) == 0:
         raise ValueError(
-            f"{path}: holds no triangle; give a mesh with faces, not a point cloud or another kind of file"
+            f"{path}: holds no triangle; it should be a mesh with faces, not a point cloud or another kind of file"
         )
     if not np.isfinite(vertices).all():
         raise ValueError(f"{path}: holds NaN or infinite vertices; clean the mesh first")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise ValueError(f"{path}: its triangles name vertices that are not there; the file is damaged")
+        raise ValueError(f"{path}: its triangles refer to vertices that are not there; the file is damaged")
     return vertices, triangles
 
 
 def read_positions(path: str | Path, height: float | None = None) -> np.ndarray:
-    """Reads where a sensor stands in a mesh, from JSON such as `{"positions": [[x, y, z], ...]}`.
+    """Reads the positions of a sensor in a mesh, from JSON such as `{"positions": [[x, y, z], ...]}`.
 
     Args:
         path: The file.
-        height: Metres above the ground to move the positions to; the file then tells theirs as `sensor_height_m`.
+        height: Height above the ground to move the positions to [m]. The file then holds their own as
+            `sensor_height_m`. None leaves them where they are.
 
     Returns:
         (N, 3) float64 metres, N > 0.

@@ -1,6 +1,6 @@
 """Where scans are taken: a mesh, waypoints in it, and the traffic around them.
 
-A sensor stands `SENSOR_HEIGHT` above a waypoint; `Place.position` is the only code that adds it.
+A sensor stands `towns.SENSOR_HEIGHT` above a waypoint, which `Place.position` adds.
 """
 
 import math
@@ -18,10 +18,7 @@ from ilnet.sensor import Sensor
 from ilnet.world import meshes, simulate, towns
 from kernels import Mesh
 
-__all__ = ["ARCHIVE_JITTER", "RAYS_JITTER", "SENSOR_HEIGHT", "Jitter", "Place", "held_out_scans", "mesh", "town"]
-
-SENSOR_HEIGHT = 1.8
-"""Metres from a waypoint on the ground up to the sensor."""
+__all__ = ["ARCHIVE_JITTER", "RAYS_JITTER", "Jitter", "Place", "held_out_scans", "mesh", "town"]
 
 
 class Jitter(NamedTuple):
@@ -77,7 +74,7 @@ class Place:
     def position(self, number: int, lift: float = 0.0) -> torch.Tensor:
         """Returns where a sensor above waypoint `number` is, (3,) float64 [m], `lift` metres higher than usual."""
         position = torch.tensor(self.waypoints[number], dtype=torch.float64)
-        position[2] += SENSOR_HEIGHT + lift
+        position[2] += towns.SENSOR_HEIGHT + lift
         return position
 
     def pose(self, number: int, lift: float = 0.0) -> torch.Tensor:
@@ -140,7 +137,7 @@ def mesh(
     if at.ndim != 2 or at.shape[1] != 3 or not np.isfinite(at).all():
         raise ValueError(f"positions is {positions}; it should be rows of three finite numbers, metres in the mesh")
     vertices, triangles = meshes.read(path)
-    return Place(vertices, triangles, at - [0.0, 0.0, SENSOR_HEIGHT], np.zeros(len(at)), device=device)
+    return Place(vertices, triangles, at - [0.0, 0.0, towns.SENSOR_HEIGHT], np.zeros(len(at)), device=device)
 
 
 def held_out_scans(place: Place, count: int, sensors: Sequence[Sensor]) -> list[list[Scan]]:

@@ -124,23 +124,26 @@ def test_equality():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"elevations": [0.1]}, "elevations has 1 beam.*at least 2 beams to interpolate between"),
-        ({"azimuths": [0.1]}, "azimuths has 1 column.*at least 2 columns"),
-        ({"elevations": [0.1, 0.2, 0.2]}, "elevations must strictly rise or strictly fall"),
-        ({"elevations": [0.1, 0.3, 0.2]}, "elevations must strictly rise or strictly fall"),
-        ({"elevations": [0.1, math.nan]}, "elevations must be finite, got 1 NaN"),
-        ({"azimuths": [0.1, math.inf, math.nan]}, "azimuths must be finite, got 2 NaN or inf"),
-        ({"elevations": [-15, 15]}, "elevations must lie within.*are these degrees"),
-        ({"azimuths": [0.1, 0.3, 0.2]}, "azimuths must strictly rise or strictly fall"),
-        ({"azimuths": np.linspace(-np.pi, np.pi, 9)}, "azimuths must span less than 2 pi.*repeat the first"),
-        ({"azimuths": np.arange(0, 360, 2.0)}, "azimuths must"),
-        ({"elevations": [[0.1, 0.2]]}, r"elevations must be a 1-D table.*\(1, 2\)"),
-        ({"elevations": "vlp-16"}, "elevations must be a 1-D table.*str"),
-        ({"min_range": -1}, "0 <= min_range < max_range < norm_range, got min_range=-1"),
+        ({"elevations": [0.1]}, "elevations has 1 beam.*at least 2, to interpolate between"),
+        ({"azimuths": [0.1]}, "azimuths has 1 column.*at least 2"),
+        ({"elevations": [0.1, 0.2, 0.2]}, "elevations is not sorted; it should strictly rise"),
+        ({"elevations": [0.1, 0.3, 0.2]}, "elevations is not sorted; it should strictly rise"),
+        ({"elevations": [0.1, math.nan]}, "elevations has 1 NaN or infinite entries"),
+        ({"azimuths": [0.1, math.inf, math.nan]}, "azimuths has 2 NaN or infinite entries"),
+        ({"elevations": [-15, 15]}, "elevations reaches 15 rad; it should lie within.*are these degrees"),
+        ({"azimuths": [0.1, 0.3, 0.2]}, "azimuths is not sorted; it should strictly rise"),
+        (
+            {"azimuths": np.linspace(-np.pi, np.pi, 9)},
+            "azimuths spans 6.28319 rad; it should span less than 2 pi.*repeat the first",
+        ),
+        ({"azimuths": np.arange(0, 360, 2.0)}, "azimuths spans 358 rad"),
+        ({"elevations": [[0.1, 0.2]]}, r"elevations has shape \(1, 2\); it should be a list of angles"),
+        ({"elevations": "vlp-16"}, "elevations is of type str; it should be a list of angles"),
+        ({"min_range": -1}, "min_range is -1, .*should be 0 <= min_range < max_range < norm_range"),
         ({"min_range": 80}, "0 <= min_range < max_range"),
-        ({"norm_range": 79}, "norm_range=79"),
-        ({"max_range": math.nan}, "max_range must be finite"),
-        ({"max_range": "far"}, "max_range must be a number of metres, got 'far'"),
+        ({"norm_range": 79}, "norm_range is 79"),
+        ({"max_range": math.nan}, "max_range is nan; it should be finite"),
+        ({"max_range": "far"}, "max_range is 'far'; it should be a number of metres"),
     ],
 )
 def test_refusals(changes, message):
@@ -319,12 +322,12 @@ def test_decimate_nothing():
 @pytest.mark.parametrize(
     ("rows", "columns", "message"),
     [
-        (1, None, "rows must be 2 to 64.*got 1"),
-        (65, None, "rows must be 2 to 64.*got 65"),
-        (None, 1000, "columns must be at least 2 and divide 2048.*got 1000"),
-        (None, 1, "columns must be at least 2"),
+        (1, None, "rows is 1; it should be 2 to 64"),
+        (65, None, "rows is 65; it should be 2 to 64"),
+        (None, 1000, "columns is 1000; it should be at least 2 and divide 2048"),
+        (None, 1, "it should be at least 2 and divide"),
         (None, 4096, "divide 2048"),
-        (None, -2, "columns must be at least 2"),
+        (None, -2, "it should be at least 2 and divide"),
     ],
 )
 def test_decimate_refusals(rows, columns, message):
@@ -345,7 +348,7 @@ def test_resize_partial_circle():
     np.testing.assert_allclose(np.rad2deg(sensor.elevations), [10, 0, -10, -20])
     np.testing.assert_allclose(np.rad2deg(sensor.azimuths), np.linspace(130, 230, 11))
     assert sensor.max_range == 50
-    with pytest.raises(ValueError, match="rows and columns must be at least 2, got 1 and 11"):
+    with pytest.raises(ValueError, match="rows and it should be at least 2 and divide, got 1 and 11"):
         partial().resize(1, 11)
 
 
@@ -392,5 +395,5 @@ def test_preset_details():
 
 
 def test_unknown_preset():
-    with pytest.raises(ValueError, match=r"unknown sensor 'vlp-32'; known are paper-16x1024, .*vlp-16.*os1-128"):
+    with pytest.raises(ValueError, match=r"sensor is 'vlp-32'; it should be one of paper-16x1024, .*vlp-16.*os1-128"):
         preset("vlp-32")

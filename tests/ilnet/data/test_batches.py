@@ -7,7 +7,7 @@ from torch.utils.data import DataLoader
 
 from ilnet import data
 from ilnet.sensor import preset
-from ilnet.world import places, simulate
+from ilnet.world import places, simulate, towns
 
 SENSOR = preset("paper-16x1024")
 
@@ -80,7 +80,7 @@ def test_sensors_sway_and_stand_at_their_height(streets):
         lowest = batch.image[:, 0].mean(1)
         heights.append(lowest * math.sin(math.radians(15)))
     heights = torch.cat(heights)
-    assert heights.mean() == pytest.approx(places.SENSOR_HEIGHT, abs=0.15)
+    assert heights.mean() == pytest.approx(towns.SENSOR_HEIGHT, abs=0.15)
     assert 0.1 < heights.std() < 0.6
 
 
@@ -152,7 +152,7 @@ def test_parts_of_a_batch_make_up_the_whole():
     for field in ("image", "ranges"):  # traffic stands elsewhere in the mesh of a part: millimetres, at edges more
         difference = getattr(whole, field) - torch.cat([getattr(half, field) for half in halves])
         assert (difference.abs() > 1e-3).double().mean() < 1e-3
-    with pytest.raises(ValueError, match="batch of 4 cannot be shared out evenly among 3"):
+    with pytest.raises(ValueError, match="batch has 4 scans; their number should be a multiple of 3"):
         first((0, 3))
 
 
@@ -201,7 +201,7 @@ def test_an_epoch_draws_each_scan_once_and_the_next_in_another_order(archive):
 def test_an_archive_without_the_size_is_refused(archive):
     with pytest.raises(ValueError, match="no scans of size 9x9; it has 4x16, 8x32"):
         data.StoredImages(archive, "9x9", "8x32", 1, 1, 0)
-    with pytest.raises(ValueError, match="queries is 257; images of 8x32 have 256 pixels"):
+    with pytest.raises(ValueError, match="queries is 257; it should be at most 256, the pixels of 8x32"):
         stored(archive, queries=257)
 
 
@@ -218,7 +218,9 @@ def test_a_sector_is_cut_from_both_images_at_one_place_and_goes_over_the_seam(ar
         firsts.add(first)
     assert len(firsts) > 5
     assert max(firsts) > 11
-    with pytest.raises(ValueError, match="queries is 81; images of 8x32 have 80 pixels"):
+    with pytest.raises(ValueError, match="queries is 81; it should be at most 80, the pixels of 8x32"):
         stored(archive, queries=81, sector=5)
-    with pytest.raises(ValueError, match="columns of 4x16 are no multiple of those of 8x32"):
+    with pytest.raises(
+        ValueError, match="target is 4x16; for a sector its columns should be a multiple of those of 8x32"
+    ):
         data.StoredImages(archive, "8x32", "4x16", 1, 1, 0, sector=3)

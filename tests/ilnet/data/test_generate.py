@@ -21,7 +21,7 @@ from ilnet.data import generate, open_archive
 from ilnet.data.archive import UNIT
 from ilnet.sensor import PAPER_INPUT, preset
 from ilnet.world import places, simulate, towns
-from ilnet.world.places import SENSOR_HEIGHT
+from ilnet.world.towns import SENSOR_HEIGHT
 from kernels import Mesh
 
 from ..conftest import yard_triangles
@@ -225,7 +225,7 @@ def test_killed_three_times_it_ends_as_if_undisturbed(tmp_path, mesh_file):
         # Ends when the last process that could write to the pipe has: no worker outlives its parent.
         _, said = run.communicate(timeout=60)
     assert run.returncode == 130
-    assert said.splitlines()[-2].startswith("interrupted: what is complete stays in")
+    assert said.splitlines()[-2].startswith("interrupted: finished units stay in")
     assert "Traceback" not in said
     assert 0 < len(open_archive(out).missing()) < units
     (out / "pose" / "c" / "0" / "0" / "0.0123.partial").write_bytes(b"torn")
@@ -294,7 +294,7 @@ def test_a_mesh_that_does_not_serve_is_one_line(tmp_path, mesh_file, monkeypatch
         (["--sizes", "64"], "--sizes: size is '64'; it should be rows x columns"),
         (["--sizes", "1x64"], "size is '1x64'; it should be rows x columns, at least 2 of each"),
         (["--sizes", "4x64,4x64"], "two sensors have 4x64 rays"),
-        (["--sensor", "vlp-61"], "unknown sensor 'vlp-61'"),
+        (["--sensor", "vlp-61"], "sensor is 'vlp-61'; it should be one of"),
         (["--sensor", "vlp-16", "--sizes", "4x64"], "exclude each other"),
         (["--mesh", "x.ply"], "go together"),
         (["--mesh", "x.ply", "--at", "x.json", "--towns", "town01"], "exclude each other"),

@@ -130,7 +130,7 @@ def test_the_specification_is_needed_and_whole(tree, tmp_path):
         with pytest.raises(FileNotFoundError, match=r"no lidar_specification.yaml beside or above its towns"):
             open_archive(tree)
     file.write_text(SPECIFICATION.replace("min_r: 2.0", "min_r: 90"))
-    with pytest.raises(ValueError, match="makes no sensor of 4x32: range limits"):
+    with pytest.raises(ValueError, match="makes no sensor of 4x32: min_range is 90"):
         open_archive(tree)
 
 

@@ -328,19 +328,22 @@ def test_pitch_and_roll_tilt_the_ground():
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        ({"range_noise": -0.1}, "range_noise is -0.1, should lie from 0 to inf: it is a standard deviation"),
-        ({"range_noise": math.nan}, "range_noise is nan, should be finite"),
+        ({"range_noise": -0.1}, "range_noise is -0.1; it should lie from 0 to inf: a standard deviation"),
+        ({"range_noise": math.nan}, "range_noise is nan; it should be finite"),
         ({"range_noise_growth": "much"}, "range_noise_growth is .*much.*should hold numbers"),
-        ({"dropout_range": 1.5}, "dropout_range is 1.5, should lie from 0 to 1: it is a probability"),
+        ({"dropout_range": 1.5}, "dropout_range is 1.5; it should lie from 0 to 1: a probability"),
         ({"dropout_incidence": -1}, "dropout_incidence is -1"),
-        ({"intensity": 0.5}, "intensity is 0.5, should be True or False"),
-        ({"divergence": 3.0}, "divergence is 3, should lie from 0 to 0.1: it is an angle in radians"),
-        ({"returns": "second"}, "returns is 'second', should be one of: first, strongest, last"),
-        ({"azimuth_offsets": [4.2, -5.6]}, "azimuth_offsets reach -5.6 rad, over half a turn: are these degrees"),
-        ({"azimuth_offsets": 0.1}, "azimuth_offsets is 0.1, should hold numbers"),
-        ({"velocity": (1.0, 2.0)}, "velocity has 2 numbers, should have three: m/s along x, y and z"),
-        ({"angular_velocity": (0, 0, math.inf)}, "angular_velocity is .*, should be finite: rad/s"),
-        ({"turn_time": 0}, "turn_time is 0, should be above"),
+        ({"intensity": 0.5}, "intensity is 0.5; it should be True or False"),
+        ({"divergence": 3.0}, "divergence is 3; it should lie from 0 to 0.1: an angle in radians"),
+        ({"returns": "second"}, "returns is 'second'; it should be one of first, strongest, last"),
+        (
+            {"azimuth_offsets": [4.2, -5.6]},
+            "azimuth_offsets reaches -5.6 rad; it should be at most half a turn: are these degrees",
+        ),
+        ({"azimuth_offsets": 0.1}, "azimuth_offsets is 0.1; it should hold numbers"),
+        ({"velocity": (1.0, 2.0)}, "velocity has 2 numbers; it should have three: m/s along x, y and z"),
+        ({"angular_velocity": (0, 0, math.inf)}, "angular_velocity is .*; it should be finite: rad/s"),
+        ({"turn_time": 0}, "turn_time is 0; it should be above 0"),
     ],
 )
 def test_bad_effects(bad, message):
@@ -349,7 +352,7 @@ def test_bad_effects(bad, message):
 
 
 def test_bad_arguments(yard):
-    with pytest.raises(ValueError, match="meshes is empty; give at least one Mesh"):
+    with pytest.raises(ValueError, match="meshes is empty; it should hold at least one Mesh"):
         simulate_with(Effects(), [], FRONT, ORIGIN, torch.Generator())
     with pytest.raises(ValueError, match="azimuth_offsets has 3 entries, but the sensor 64 beams: give one for each"):
         scan(Effects(azimuth_offsets=[0.1, 0.0, 0.1]), yard)
