@@ -9,7 +9,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ilnet.sensor import PRESETS, Sensor, angles_to_directions, directions_to_angles, preset
+from ilnet.sensor import (
+    PRESETS,
+    Sensor,
+    angles_to_directions,
+    directions_to_angles,
+    format_size,
+    parse_size,
+    preset,
+)
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
@@ -348,7 +356,7 @@ def test_resize_partial_circle():
     np.testing.assert_allclose(np.rad2deg(sensor.elevations), [10, 0, -10, -20])
     np.testing.assert_allclose(np.rad2deg(sensor.azimuths), np.linspace(130, 230, 11))
     assert sensor.max_range == 50
-    with pytest.raises(ValueError, match="rows and it should be at least 2 and divide, got 1 and 11"):
+    with pytest.raises(ValueError, match="rows and columns are 1 and 11; each should be at least 2"):
         partial().resize(1, 11)
 
 
@@ -397,3 +405,15 @@ def test_preset_details():
 def test_unknown_preset():
     with pytest.raises(ValueError, match=r"sensor is 'vlp-32'; it should be one of paper-16x1024, .*vlp-16.*os1-128"):
         preset("vlp-32")
+
+
+def test_a_size_is_text_both_ways():
+    assert preset("paper-16x1024").size == "16x1024"
+    assert parse_size("16x1024") == preset("paper-16x1024").shape
+    assert format_size((128, 2048)) == "128x2048"
+
+
+@pytest.mark.parametrize("size", ["16", "x", "16x", "1x64", "64x1", "-16x1024", "16x1024x2", "16.0x1024", "a x b", ""])
+def test_what_is_no_size(size):
+    with pytest.raises(ValueError, match=f"size is '{size}'; it should be rows x columns, at least 2 of each"):
+        parse_size(size)

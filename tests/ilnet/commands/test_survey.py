@@ -157,6 +157,15 @@ def test_a_mesh_is_seen_from_the_height_of_the_measured_scan(files):
     np.testing.assert_allclose(again.slopes, there.slopes, atol=0.02)
 
 
+def test_two_sources_of_one_name_are_refused(files):
+    (files / "more").mkdir()
+    scan, mesh, positions = (files / name for name in ("measured.npz", "yard.ply", "yard.json"))
+    scans = [scan, (files / "more" / "measured.npz")]
+    for arguments in ((scans, [], []), ([], [(mesh, positions)] * 2, []), ([], [], ["town01", "town01"])):
+        with pytest.raises(ValueError, match=r"two sources are called (measured|yard|town01); rename a file"):
+            compare(*arguments)
+
+
 def test_survey_prints_a_table_and_draws(files):
     options = ["survey", "--scan", "measured.npz", "--mesh", "yard.ply", "--at", "yard.json", "--town", "town01"]
     done = CliRunner().invoke(cli, [*(str(files / o) if "." in o else o for o in options), "--out", str(files / "new")])

@@ -135,6 +135,13 @@ def test_several_workers_do_the_same(undisturbed, tmp_path):
     assert files(many.path) == files(undisturbed.path)
 
 
+def test_without_fork_one_process_does_the_work(undisturbed, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(generate.multiprocessing, "get_all_start_methods", lambda: ["spawn"])
+    monkeypatch.setattr(generate.multiprocessing, "get_context", lambda method: pytest.fail(f"asked for {method}"))
+    assert files(make(tmp_path / "one", workers=3).path) == files(undisturbed.path)
+    assert "this system cannot fork: one process does the work of 3 workers" in capsys.readouterr().err
+
+
 def test_shards_merge_by_copying(undisturbed, tmp_path):
     parts = [make(tmp_path / str(i), shard=(i, 3)) for i in (1, 2, 3)]
     assert [part.missing() for part in parts] == [[1, 2], [0, 2, 3], [0, 1, 3]]

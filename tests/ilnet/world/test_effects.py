@@ -354,5 +354,5 @@ def test_bad_effects(bad, message):
 def test_bad_arguments(yard):
     with pytest.raises(ValueError, match="meshes is empty; it should hold at least one Mesh"):
         simulate_with(Effects(), [], FRONT, ORIGIN, torch.Generator())
-    with pytest.raises(ValueError, match="azimuth_offsets has 3 entries, but the sensor 64 beams: give one for each"):
+    with pytest.raises(ValueError, match="azimuth_offsets has 3 entries; it should have 64, one for each beam"):
         scan(Effects(azimuth_offsets=[0.1, 0.0, 0.1]), yard)
