@@ -229,31 +229,21 @@ class Mesh:
             ValueError: If a shape does not fit, `pose` is not a rotation and a translation, a table is empty, not
                 finite or out of bounds, or `max_range` is not a positive number.
         """
-        if pose.shape != (4, 4) or not pose.isfinite().all():
-            raise ValueError(f"pose has shape {tuple(pose.shape)}; it should be (4, 4), of finite numbers")
+        _check_pose(pose)
         for name, table in (("elevations", elevations), ("azimuths", azimuths)):
             if table.ndim != 1 or len(table) == 0 or not table.isfinite().all():
                 raise ValueError(f"{name} has shape {tuple(table.shape)}; it should be (N,), of N > 0 finite numbers")
         _check_range(max_range)
-        pose = pose.double()
-        rotation, last = pose[:3, :3], pose.new_tensor([0.0, 0.0, 0.0, 1.0])
-        skew = max(
-            float((rotation @ rotation.T - rotation.new_ones(3).diag()).abs().max()),
-            float((pose[3] - last).abs().max()),
-        )
-        if skew > _ROTATION or rotation.det() < 0:
+        if (steepest := float(elevations.abs().max())) > math.pi / 2:
+            raise ValueError(f"elevations reaches {steepest} rad; it should lie within ±π/2")
+        rising = np.sort(azimuths.numpy(force=True).astype(np.float64))
+        if rising[-1] - rising[0] > math.tau * (1 + 1e-6):
+            raise ValueError(f"azimuths runs from {rising[0]} to {rising[-1]} rad; it should span at most one turn")
+        if (np.diff(rising) == 0).any():
             raise ValueError(
-                f"pose is {pose.tolist()}; it should be a rotation and a translation, with last row 0 0 0 1"
+                f"azimuths has {len(np.unique(rising))} values in {len(rising)} columns; they should differ"
             )
-        if elevations.abs().max() > math.pi / 2:
-            raise ValueError(f"elevations reaches {float(elevations.abs().max())} rad; it should lie within ±π/2")
-        if len(azimuths.unique()) < len(azimuths) or azimuths.max() - azimuths.min() > math.tau * (1 + 1e-6):
-            low, high = float(azimuths.min()), float(azimuths.max())
-            raise ValueError(
-                f"azimuths has {len(azimuths.unique())} values of {len(azimuths)} from {low} to {high} rad; it should"
-                " have different ones within one turn"
-            )
-        pose = pose.to(self.device)
+        pose = pose.to(self.device).double()
         origin, rotation = pose[:3, 3] - self._middle, pose[:3, :3]
         return project_triangles(self._get_clusters(), origin, rotation, elevations, azimuths, float(max_range))
 
@@ -272,6 +262,18 @@ class Mesh:
         if self.device.type != "cpu":
             return False
         return rays > _FEW_RAYS + within_reach(self._get_clusters(), position - self._middle, max_range) / 4
+
+
+def _check_pose(pose: torch.Tensor) -> None:
+    if pose.shape != (4, 4) or not pose.isfinite().all():
+        raise ValueError(f"pose has shape {tuple(pose.shape)}; it should be (4, 4), of finite numbers")
+    numbers = pose.numpy(force=True).astype(np.float64)
+    rotation = numbers[:3, :3]
+    skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if max(skew, np.abs(numbers[3] - (0, 0, 0, 1)).max()) > _ROTATION or np.linalg.det(rotation) < 0:
+        raise ValueError(
+            f"pose is {numbers.tolist()}; it should be a rotation and a translation, with last row 0 0 0 1"
+        )
 
 
 def _check_range(max_range: float) -> None:

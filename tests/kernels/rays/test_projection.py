@@ -103,9 +103,9 @@ def test_any_number_of_cores_gives_the_same(device):
         ((torch.eye(4), torch.tensor([1.6]), torch.zeros(1), 9.0), r"elevations reaches 1\.6"),
         (
             (torch.eye(4), torch.zeros(2), torch.tensor([0.0, 100.0]), 9.0),
-            r"azimuths has 2 values of 2 from 0\.0 to 100",
+            r"azimuths runs from 0\.0 to 100",
         ),
-        ((torch.eye(4), torch.zeros(2), torch.zeros(2), 9.0), "azimuths has 1 values of 2"),
+        ((torch.eye(4), torch.zeros(2), torch.zeros(2), 9.0), "azimuths has 1 values in 2 columns"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):
