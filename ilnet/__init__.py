@@ -1,7 +1,7 @@
 """The Implicit LiDAR Network (ICRA 2022): sensors, scans, towns, models, training and evaluation.
 
-What people use most has a short name here: `from ilnet import data, models, simulate`. Each is imported when it is
-first asked for.
+The modules that are used most have short names here: `from ilnet import data, models, simulate`. Each is imported on
+first use.
 """
 
 from importlib import import_module

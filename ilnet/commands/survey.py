@@ -1,10 +1,9 @@
 """Simulated scans beside measured ones: how many rays return, from how far, across which edges, off which surfaces.
 
-What a scan looks like depends on its rays at least as much as on what stands around them. So towns and meshes are
-scanned with the very rays of each measured scan: with its beam tables, its range limits, at the height above the ground
-that it shows itself, and with the range noise of `NOISE`; no return is lost. Returns beyond a sensor's maximum range
-count as none, and pixels with a return nearer than its minimum range are left out: there the sensor sees what carries
-it.
+A scan depends on its rays at least as much as on its surroundings. So towns and meshes are scanned with the rays of
+each measured scan: its beam tables, its range limits, and its height above the ground, which the scan itself shows.
+Their ranges have the noise of `NOISE`, and no return is lost. Returns beyond a sensor's maximum range count as none.
+Pixels with a return nearer than its minimum range are left out: there the sensor sees its own vehicle.
 
 Measured scans are not levelled: a tilted sensor sees tilted ground.
 """
@@ -27,20 +26,20 @@ from ilnet.world.effects import Effects
 __all__ = ["Entry", "Statistics", "compare", "draw", "ground_height", "records", "statistics", "table"]
 
 NOISE = Effects(range_noise=0.01, range_noise_growth=0.0005)
-"""Of simulated scans: what ranges along smooth surfaces of measured ones scatter, 1 to 2 cm near and 3 to 6 cm far."""
+"""Noise of simulated scans: as in measured ones along smooth surfaces, 1 to 2 cm near and 3 to 6 cm far."""
 RANGE_BINS = tuple(range(0, 81, 2))
 """Borders of the histogram of ranges [m]."""
 SLOPE_BINS = tuple(range(0, 91, 5))
 """Borders of the histogram of slopes [degrees]."""
 EDGE = (0.25, 0.025)
-"""A pixel is at a range edge that departs from what its neighbours let expect by more than so many metres, and by more
-than that part of its range."""
+"""A pixel is at a range edge where its range differs from the one that its neighbours predict by more than this many
+metres, and by more than this share of its range."""
 
-# Flat, slanted and upright surfaces end here [degrees].
+# Slopes at which flat surfaces end and upright ones begin [degrees]; slanted ones lie between.
 _FLAT, _UPRIGHT = 15, 75
-# Degrees to either side of a pixel over which its surface is fitted: wide enough for noise to cancel.
+# A pixel's surface is fitted over this angle to either side [degrees]: wide enough for noise to cancel.
 _WINDOW = 0.75
-# In a town; a mesh brings its own.
+# Number of positions in a town; a mesh has its own.
 _POSITIONS = 10
 # Used where no measured scan brings a sensor.
 _SENSOR = preset("paper-64x1024")
@@ -48,13 +47,14 @@ _SENSOR = preset("paper-64x1024")
 
 @dataclass(frozen=True)
 class Statistics:
-    """Of a scan, or the mean of several.
+    """Statistics of a scan, or the means over several.
 
     Attributes:
         return_rate: Share of the pixels that have a return within the sensor's limits.
-        median_range: Of the returns [m].
-        edges: Share of pixels at range edges, of all whose two neighbours in their row, or in their column, returned.
-        smooth: Share of the returns around which all is one surface: no edge and no missing return within 0.75 degrees.
+        median_range: Median of the returns' ranges [m].
+        edges: Share of pixels at range edges, of those whose two neighbours in their row or in their column returned.
+        smooth: Share of the returns that lie on one surface with all pixels around: there is no edge and no missing
+            return within 0.75 degrees.
         ranges: Shares of the returns in `RANGE_BINS`.
         slopes: Shares of the smooth returns whose surface is inclined to the horizontal as in `SLOPE_BINS`.
     """
@@ -81,11 +81,12 @@ class Statistics:
 
 
 class Entry(NamedTuple):
-    """What one source shows the rays of one sensor."""
+    """The scans of one source with the rays of one sensor."""
 
     sensor: str
     """The measured scan whose rays these are, or the sensor's preset."""
     source: str
+    """The measured scan, the town or the mesh."""
     kind: str
     """"measured", "town" or "mesh"."""
     scans: list[Statistics]
@@ -104,15 +105,15 @@ class Entry(NamedTuple):
 def statistics(scan: Scan) -> Statistics:
     """Returns the statistics of a scan.
 
-    The inverse of the range along a plane is linear in the angles, near enough, from pixel to pixel. So a pixel lies on
-    a surface with its neighbours where its inverse range is between theirs, however flat the rays graze the surface;
-    `EDGE` says what departs from it. And the plane through a pixel's surroundings is a linear fit to inverse ranges.
+    Along a plane the inverse range is nearly linear in the angles. So the inverse ranges of a pixel's neighbours
+    predict its own where all lie on one surface, at any angle of incidence; `EDGE` is the tolerance. The plane through
+    a pixel's surroundings is a linear fit to their inverse ranges.
 
     Args:
-        scan: With some return between its sensor's minimum and maximum range.
+        scan: A scan with some return between its sensor's minimum and maximum range.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is no such return.
     """
     ranges, sensor = scan.ranges.cpu(), scan.sensor
     seen = _seen(scan)
@@ -134,7 +135,7 @@ def statistics(scan: Scan) -> Statistics:
 
 
 def ground_height(scan: Scan) -> float | None:
-    """Returns the height of the sensor above the flat surfaces below it [m], their median; None where it sees none."""
+    """Returns the median height of the sensor above the flat surfaces below it [m]; None where it sees none."""
     slope, z = _surfaces(scan)
     ground = z[(slope < _FLAT) & (z < 0)]
     return -float(ground.median()) if len(ground) else None
@@ -174,12 +175,12 @@ def _edges(scan: Scan) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def _surfaces(scan: Scan) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns of all pixels on smooth surfaces the slope (N,) [degrees] and the z coordinate (N,) [m]."""
+    """Returns the slopes (N,) [degrees] and z coordinates (N,) [m] of all pixels on smooth surfaces."""
     sensor, ranges = scan.sensor, scan.ranges.cpu().double()
     edge, _, surrounded = _edges(scan)
     inverse = (1 / ranges).where(_seen(scan), 0.0)
     rays = sensor.directions().double().movedim(-1, 0)
-    # The plane n·x = 1 that is nearest to 1/r = n·d over a window of pixels: a sum over it of d dᵀ, and of d / r.
+    # The plane n·x = 1 that fits 1/r = n·d best over a window of pixels takes the sums of d dᵀ and of d / r over it.
     products = torch.cat(((rays[:, None] * rays).flatten(0, 1), rays * inverse, (surrounded & ~edge)[None].double()))
     rows, columns = (
         max(1, round(math.radians(_WINDOW) / abs(table[-1] - table[0]) * (len(table) - 1)))
@@ -233,7 +234,7 @@ def compare(files: Iterable[Path], mesh_files: Iterable[tuple[Path, Path]], town
 
 
 def _refuse_doubles(names: Sequence[str]) -> None:
-    """Results go by the names of their sources, so two of one name would become one."""
+    """Raises a ValueError where two sources have one name, by which results are told apart."""
     for number, name in enumerate(names):
         if name in names[:number]:
             raise ValueError(f"two sources are called {name}; rename a file, or leave one out")
@@ -263,7 +264,7 @@ def _examined(source: Path | str, scan: Scan) -> Statistics:
 
 
 def records(entries: Iterable[Entry]) -> list[dict[str, Any]]:
-    """Returns what JSON holds of each entry: how many scans, the summary (mean, lowest, highest), the histograms."""
+    """Returns each entry as JSON values: the number of scans, the summary (mean, lowest, highest), the histograms."""
 
     def rounded(values: Iterable[float]) -> list[float]:
         return [round(value, 4) for value in values]
@@ -300,7 +301,7 @@ _TITLES = {
 
 
 def table(entries: Sequence[Entry]) -> str:
-    """Returns the means of all entries as text, those with the same rays together."""
+    """Returns the means of all entries as a table, grouped by their rays."""
     wide = max(len(entry.source) for entry in entries) + 2
     lines = []
     for sensor in dict.fromkeys(entry.sensor for entry in entries):

@@ -39,7 +39,7 @@ ARCHIVE_JITTER = Jitter(0.1, math.radians(1.0))
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Triangles to cast rays at, waypoints to stand over, and the traffic of a town where it is one.
+    """A mesh to cast rays at, waypoints for a sensor to stand over, and the traffic of a town where it is one.
 
     The ray casting mesh is made when it is first needed, and again in a process that a place is sent to.
 

@@ -109,7 +109,7 @@ def _images(mesh: Mesh, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
     tables = torch.tensor(sensor.elevations), torch.tensor(sensor.azimuths)
     directions, rays = sensor.directions().view(-1, 3), math.prod(sensor.shape)
     images = [torch.empty(0, *sensor.shape, device=mesh.device)]
-    for some in poses.split(1 if mesh.device.type == "cpu" else max(1, _RAYS_AT_ONCE // rays)):
+    for some in poses.to(mesh.device).split(1 if mesh.device.type == "cpu" else max(1, _RAYS_AT_ONCE // rays)):
         if len(some) == 1 and mesh.projects_faster(some[0, :3, 3], rays, sensor.max_range):
             images.append(mesh.project(some[0], *tables, sensor.max_range).unsqueeze(0))
         else:
