@@ -84,31 +84,6 @@ def test_sensors_sway_and_stand_at_their_height(streets):
     assert 0.1 < heights.std() < 0.6
 
 
-def test_held_out_scans_come_from_waypoints_spread_over_the_town():
-    street = places.town("town01", 0)
-    pairs = places.held_out_scans(street, 3, [SENSOR, preset("paper-64x1024")])
-    assert [[s.ranges.shape for s in pair] for pair in pairs] == [[(16, 1024), (64, 1024)]] * 3
-    for scan, dense in pairs:
-        assert (scan.ranges > 0).float().mean() > 0.5
-        # The outermost beams are the same beams, and other engines may have cast them.
-        for few, many in ((0, 0), (15, 63)):
-            assert ((scan.ranges[few] - dense.ranges[many]).abs() > 1e-3).double().mean() < 1e-3
-    assert not torch.equal(pairs[0][0].ranges, pairs[1][0].ranges)
-
-
-def test_every_scan_meets_other_traffic():
-    """A sensor that stays where it is measures another world, unless the seed is the same."""
-    street = places.town("town01")
-    pose = street.pose(400)
-    first, again, other = (simulate.scan(street.world(pose[:3, 3], seed), SENSOR, pose).ranges for seed in (0, 0, 1))
-    empty = simulate.scan(street.mesh, SENSOR, pose).ranges
-    assert torch.equal(first, again)
-    assert 0.002 < (first != other).double().mean() < 0.4
-    nearer = (first > 0) & ((empty == 0) | (first < empty))
-    assert nearer.any()
-    assert ((first == empty) | nearer).all()
-
-
 def test_continuous_rays_meet_the_traffic_of_their_own_crop(monkeypatch):
     """What crops measure is what one crop alone measures in the world it stands in."""
     street = places.town("town01")
