@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ import torch
 import warp as wp
 from torch.utils.data import DataLoader, Dataset
 
-from kernels import Mesh, gather_blend
+from kernels import Mesh, gather_blend, plane_prior
 from kernels.launch import concrete, launch
 from kernels.plane_prior import _kernels as _plane_prior
 from kernels.stencil import grid_of
@@ -73,6 +74,38 @@ def test_a_module_is_compiled_once(cores, tmp_path):
 
 def kernel_folders(cache):
     return sorted(folder.name for folder in cache.rglob("wp_*") if folder.is_dir())
+
+
+@pytest.mark.parametrize("cores", [1, 2])
+def test_threads_that_launch_first_load_a_module_one_after_the_other(cores, monkeypatch, one_thread):
+    module = _plane_prior[torch.float32].module
+    load, asked, first_may_go = module.load, [], threading.Event()
+
+    def slow(device, block_dim=None):
+        asked.append(block_dim)
+        assert first_may_go.wait(60)
+        return load(device, block_dim)
+
+    torch.set_num_threads(cores)
+    monkeypatch.setattr("kernels.launch._loaded", set())
+    monkeypatch.setattr(module, "load", slow)
+    results = []
+
+    def use():
+        results.append(plane_prior(torch.ones(1, 4, 5), torch.ones(1, QUERIES, 2)))
+
+    threads = [threading.Thread(target=use) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    while not asked:
+        time.sleep(0.01)
+    time.sleep(0.1)  # long enough for the others to ask, if they could
+    assert asked == [1]
+    first_may_go.set()
+    for thread in threads:
+        thread.join()
+    assert len(results) == 4
+    assert set(asked) == {1}  # never another block size
 
 
 @pytest.mark.parametrize("moved", ["image", "queries", "prior_out"])
