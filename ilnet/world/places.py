@@ -32,9 +32,9 @@ class Jitter(NamedTuple):
 
 # Archives on disk and the shipped weights were made with these values; another value would change what they mean.
 RAYS_JITTER = Jitter(0.3, math.radians(2.0))
-"""Of the crops that networks learn from, see `ilnet.data.ContinuousRays`."""
+"""Jitter of the crops that networks learn from, see `ilnet.data.ContinuousRays`."""
 ARCHIVE_JITTER = Jitter(0.1, math.radians(1.0))
-"""Of the scans in an archive, see `ilnet.data.generate`."""
+"""Jitter of the scans in an archive, see `ilnet.data.generate`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Place:
         waypoints: (N, 3) points on the ground [m].
         headings: (N,) directions in which a sensor looks [rad], counter-clockwise from +x.
         town: The town whose traffic is drawn; None where there is no traffic.
-        device: Where the mesh is kept and its rays are cast.
+        device: Device that the mesh is kept and its rays are cast on.
     """
 
     vertices: np.ndarray
@@ -88,7 +88,7 @@ class Place:
 
         Args:
             position: (3,) of the sensor [m].
-            seed: Of the draw; the same place, position and seed give the same traffic.
+            seed: Seed of the draw; the same place, position and seed give the same traffic.
             sector: See `towns.traffic`.
 
         Returns:
@@ -110,7 +110,7 @@ def town(name: str, seed: int = 0, device: torch.device | str = "cpu") -> Place:
     Args:
         name: One of `towns.NAMES`.
         seed: Another seed gives another town of the same character.
-        device: Where its rays are cast.
+        device: Device that its rays are cast on.
 
     Raises:
         ValueError: If there is no such town.
@@ -127,7 +127,7 @@ def mesh(
     Args:
         path: A file that `meshes.read` reads, metres, z up.
         positions: (N, 3) where the sensor stands in the mesh [m]. It looks along x.
-        device: Where its rays are cast.
+        device: Device that its rays are cast on.
 
     Raises:
         FileNotFoundError: If there is no such file.

@@ -60,7 +60,7 @@ def cast(mesh: Mesh, pose: torch.Tensor, directions: torch.Tensor, max_range: fl
         mesh: What they may meet, in metres.
         pose: (..., 4, 4) transforms from the sensor frame to that of the mesh.
         directions: (..., N, 3) unit vectors in the sensor frame.
-        max_range: How far they reach [m].
+        max_range: Greatest range that is found [m].
 
     Returns:
         (..., N) float32 ranges [m] on the mesh's device; 0 where nothing is met.
