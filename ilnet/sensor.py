@@ -10,7 +10,7 @@ Python code holds radians and metres. Degrees appear only in files and in the pr
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -66,6 +66,7 @@ class Sensor:
     max_range: float = 80.0
     norm_range: float = 100.0
     name: str = ""
+    _tensors: dict[str, tuple[torch.Tensor, torch.Tensor]] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
         elevations = _table("elevations", self.elevations)
@@ -106,8 +107,8 @@ class Sensor:
             found = ", ".join(f"{name} is {value:g}" for name, value in limits.items())
             raise ValueError(f"{found}; they should be 0 <= min_range < max_range < norm_range")
 
-        for field, value in {"elevations": elevations, "azimuths": azimuths, **limits, "name": str(self.name)}.items():
-            object.__setattr__(self, field, value)
+        for name, value in {"elevations": elevations, "azimuths": azimuths, **limits, "name": str(self.name)}.items():
+            object.__setattr__(self, name, value)
         elevations.setflags(write=False)
         azimuths.setflags(write=False)
 
@@ -151,6 +152,16 @@ class Sensor:
         """Returns the unit vectors of all rays, (H, W, 3) float32, in the sensor frame."""
         elevations, azimuths = torch.tensor(self.elevations), torch.tensor(self.azimuths)
         return angles_to_directions(elevations[:, None], azimuths[None, :]).float()
+
+    def angles(self, device: torch.device | str = "cpu") -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the elevations (H,) and azimuths (W,) as float32 tensors [rad] on a device, made once for each."""
+        key = str(device)
+        if key not in self._tensors:
+            elevations, azimuths = (
+                torch.tensor(table, dtype=torch.float32, device=device) for table in (self.elevations, self.azimuths)
+            )
+            self._tensors[key] = elevations, azimuths
+        return self._tensors[key]
 
     def locate(self, elevation: torch.Tensor | float, azimuth: torch.Tensor | float) -> torch.Tensor:
         """Returns the pixel coordinates of laser directions.
@@ -201,6 +212,10 @@ class Sensor:
         row, column = queries.unbind(-1)
         inside = (row >= -0.5) & (row <= rows - 0.5)
         return inside if self.wrap else inside & (column >= -0.5) & (column <= columns - 0.5)
+
+    def upright(self) -> "Sensor":
+        """Returns the same sensor with its lowest beam first and its azimuths rising, as networks see it."""
+        return replace(self, elevations=np.sort(self.elevations), azimuths=np.sort(self.azimuths))
 
     def decimation(self, rows: int | None = None, columns: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Returns the numbers of the rows and columns that `decimate` keeps.

@@ -89,6 +89,11 @@ def demo(
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of weights and rays.")
 @click.option("--data", type=Path, metavar="DIR", help="Learn from stored images: an archive or a tree of .rimg files.")
 @click.option("--size", type=_Size(), help="Size of the stored images; 128x2048 by default.")
+@click.option(
+    "--sensors",
+    metavar="any|NAMES",
+    help="Input sensors of the rays: presets, comma separated, or any. The paper's by default; any for iln-surfaces.",
+)
 @click.option("--out", type=Path, default=Path("runs"), show_default=True, help="Folder for weights, figures, logs.")
 def train(
     model: str,
@@ -97,23 +102,30 @@ def train(
     seed: int,
     data: Path | None,
     size: tuple[int, int] | None,
+    sensors: str | None,
     out: Path,
 ) -> None:
     """Train MODEL on rays at continuous directions; an interrupted run in --out goes on where it stopped.
 
     `torchrun --nproc-per-node N -m ilnet train MODEL` shares each batch among N processes or GPUs.
     """
+    from ilnet import sensor
     from ilnet.learning import train
     from ilnet.sensor import PAPER_INPUT, PAPER_TARGET
 
     if size and not data:
         raise click.UsageError("--size goes with --data DIR")
+    if sensors and data:
+        raise click.UsageError("--sensors and --data exclude each other: stored images have the sensor that took them")
     if not data and train.learns_from_images(model, preset):
         raise click.UsageError(
             f"{model} with preset {preset} learns from stored images: make some with `python -m ilnet simulate "
             f"--sizes {PAPER_INPUT.size},{PAPER_TARGET.size} --out DIR`, and name them with --data DIR"
         )
-    figures = train.train(model, preset, out, steps, seed, data, size or PAPER_TARGET.shape)
+    wanted = None
+    if sensors:
+        wanted = [] if sensors == "any" else [sensor.preset(name) for name in sensors.split(",")]
+    figures = train.train(model, preset, out, steps, seed, data, size or PAPER_TARGET.shape, wanted)
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
 
 

@@ -15,9 +15,11 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from ilnet.data.archive import Archive
 from ilnet.data.rimg import RangeImageTree
+from ilnet.data.sensors import draw_effects, draw_sensor
 from ilnet.sensor import Sensor, angles_to_directions
 from ilnet.world import simulate
-from ilnet.world.places import RAYS_JITTER, Place
+from ilnet.world.effects import nearer, spoil
+from ilnet.world.places import ANY_JITTER, RAYS_JITTER, Place
 from kernels import Mesh
 
 __all__ = ["Batch", "ContinuousRays", "StoredImages"]
@@ -37,19 +39,23 @@ class Batch(NamedTuple):
     """(B, Q) ranges along the queries [m], no return filled with `norm_range`."""
     wrap: bool
     """Whether the images go full circle."""
+    sensor: Sensor
+    """The sensor of the images."""
 
 
 class ContinuousRays(IterableDataset):
     """Endless batches of crops and of rays at random directions between their pixels.
 
-    Each crop has a place, a waypoint, a height, a yaw, a tilt and traffic of its own. A query's direction is uniform in
-    elevation and azimuth: no stored image contains it. Rays are cast when a batch is asked for, on the device of the
-    places: on a GPU, or on the CPU, where the workers of a `DataLoader` take turns. The batches are the same for any
-    number of workers.
+    Each crop has a place, a waypoint, a height, a yaw, a tilt and traffic of its own. A query's direction is uniform
+    between the beams of the sensor and in azimuth: no stored image contains it. Rays are cast when a batch is asked
+    for, on the device of the places: on a GPU, or on the CPU, where the workers of a `DataLoader` take turns. The
+    batches are the same for any number of workers.
 
     Args:
         places: Where scans are taken, all on one device; each is drawn equally often.
-        sensor: The input sensor.
+        sensors: The input sensor, or several of which each batch has one; lowest beam first, azimuths rising. If empty,
+            `draw_sensor` makes one up for each batch, and `draw_effects` what it does to the images; the ranges to be
+            predicted stay clean.
         crops: Number B of crops in a batch.
         columns: Number W of columns in a crop.
         queries: Number Q of rays per crop.
@@ -61,7 +67,7 @@ class ContinuousRays(IterableDataset):
     def __init__(
         self,
         places: Sequence[Place],
-        sensor: Sensor,
+        sensors: Sensor | Sequence[Sensor],
         crops: int,
         columns: int,
         queries: int,
@@ -69,55 +75,77 @@ class ContinuousRays(IterableDataset):
         start: int = 0,
         part: tuple[int, int] = (0, 1),
     ):
-        self.places, self.crops, self.queries, self.seed, self.start = places, crops, queries, seed, start
+        self.sensors = (sensors,) if isinstance(sensors, Sensor) else tuple(sensors)
+        self.places, self.crops, self.columns = places, crops, columns
+        self.queries, self.seed, self.start = queries, seed, start
         meshes = [place.mesh for place in places]  # made here, once, and not by every worker
         self.device = meshes[0].device
-        self.sensor = replace(sensor, azimuths=sensor.azimuths[:columns], name=f"{sensor.name} crop")
         self.part = _part(crops, part)
 
     def __iter__(self) -> Iterator[Batch]:
         return map(self._draw, _numbers(self.start))
 
     def _draw(self, number: int) -> Batch:
-        generator = _generator(self.seed, number)
+        generator, rng = _generator(self.seed, number), np.random.default_rng([self.seed, number])
 
         def uniform(low: float, high: float, *shape: int) -> torch.Tensor:
             return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
 
-        crops, sensor = self.crops, self.sensor
-        elevation = uniform(*sensor.elevations[[0, -1]], crops, self.queries)[self.part]
+        whole = self.sensors[int(rng.integers(len(self.sensors)))] if self.sensors else draw_sensor(rng)
+        sensor = replace(whole, azimuths=whole.azimuths[: self.columns], name=f"{whole.name} crop")
+        crops, jitter = self.crops, RAYS_JITTER if self.sensors else ANY_JITTER
+        row = uniform(0, sensor.shape[0] - 1, crops, self.queries)[self.part]
+        elevation = torch.from_numpy(np.interp(row, np.arange(sensor.shape[0]), sensor.elevations))
         azimuth = uniform(*sensor.azimuths[[_MARGIN, -1 - _MARGIN]], crops, self.queries)[self.part]
         grid = sensor.directions().double().view(1, -1, 3).expand(len(azimuth), -1, -1)
         rays = torch.cat((grid, angles_to_directions(elevation, azimuth)), 1)
         where = torch.randint(len(self.places), (crops,), generator=generator)
-        along, lift = uniform(0, 1, crops), uniform(-RAYS_JITTER.height, RAYS_JITTER.height, crops)
-        turn, tilt = uniform(-math.pi, math.pi, crops), uniform(-RAYS_JITTER.tilt, RAYS_JITTER.tilt, 2, crops)
+        along, lift = uniform(0, 1, crops), uniform(-jitter.height, jitter.height, crops)
+        turn, tilt = uniform(-math.pi, math.pi, crops), uniform(-jitter.tilt, jitter.tilt, 2, crops)
         stands = zip(where.tolist(), along.tolist(), lift.tolist(), strict=True)
         at = torch.stack([self._position(*stand) for stand in stands])
         where, pose = where[self.part], simulate.pose(at, turn, *tilt)[self.part]
-        ranges = self._cast_traffic(where, pose, rays, number)
+        ranges, cosines = self._cast(where, pose, rays, number, sensor, jitter.tilt)
+        ranges = ranges.where(ranges >= max(sensor.min_range, 1e-9), 0.0)
+        image, ranges = ranges.split([grid.shape[1], self.queries], 1)
+        if not self.sensors:
+            shape = crops, grid.shape[1]
+            noise, luck = torch.randn(shape, generator=generator), torch.rand(shape, generator=generator)
+            noise, luck = noise[self.part].to(image), luck[self.part].to(image)
+            image = spoil(draw_effects(rng), image, cosines[:, : grid.shape[1]], sensor, noise, luck)
+        image, ranges = (found.where(found > 0, sensor.norm_range).cpu() for found in (image, ranges))
+        located = sensor.locate(elevation, azimuth)
+        return Batch(image.unflatten(1, sensor.shape), located, ranges.contiguous(), False, sensor)
+
+    def _cast(
+        self, where: torch.Tensor, pose: torch.Tensor, rays: torch.Tensor, number: int, sensor: Sensor, tilt: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns the ranges (B, N) of the rays of each crop, 0 where nothing is met, and the cosines of incidence."""
+        ranges, cosines = self._cast_traffic(where, pose, rays, number, sensor, tilt)
         for which in where.unique().tolist():
             chosen = where == which
-            standing = simulate.cast(self.places[which].mesh, pose[chosen], rays[chosen], sensor.max_range)
-            ranges[chosen] = simulate.nearest([standing, ranges[chosen]])
-        ranges = ranges.where(ranges >= max(sensor.min_range, 1e-9), sensor.norm_range).cpu()
-        image, ranges = ranges.split([grid.shape[1], self.queries], 1)
-        return Batch(image.unflatten(1, sensor.shape), sensor.locate(elevation, azimuth), ranges.contiguous(), False)
+            hits = simulate.hits(self.places[which].mesh, pose[chosen], rays[chosen], sensor.max_range)
+            front = nearer(hits.range, ranges[chosen])
+            ranges[chosen] = hits.range.where(front, ranges[chosen])
+            cosines[chosen] = hits.cosine.where(front, cosines[chosen])
+        return ranges, cosines
 
     def _position(self, where: int, along: float, lift: float) -> torch.Tensor:
         place = self.places[where]
         return place.position(int(along * len(place.waypoints)), lift)
 
-    def _cast_traffic(self, where: torch.Tensor, pose: torch.Tensor, rays: torch.Tensor, number: int) -> torch.Tensor:
-        """Returns the ranges (B, N) to the vehicles and people of each crop; 0 where none is met.
+    def _cast_traffic(
+        self, where: torch.Tensor, pose: torch.Tensor, rays: torch.Tensor, number: int, sensor: Sensor, tilt: float
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Returns ranges and cosines (B, N) of the vehicles and people of each crop; 0 where none is met.
 
         They are one mesh, in which the crops stand so far apart that none sees another's.
         """
         apart = torch.zeros(len(where), 3, dtype=torch.float64)
-        apart[:, 0] = torch.arange(len(where)) * 4 * self.sensor.max_range
-        first, last = self.sensor.azimuths[[0, -1]]
+        apart[:, 0] = torch.arange(len(where)) * 4 * sensor.max_range
+        first, last = sensor.azimuths[[0, -1]]
         middle = angles_to_directions(torch.tensor(0.0), torch.tensor((first + last) / 2)).double()
-        half = abs(last - first) / 2 + RAYS_JITTER.tilt
+        half = abs(last - first) / 2 + tilt
         corners = [torch.empty(0, 3)]
         for crop, which in enumerate(where.tolist()):
             position, ahead = pose[crop, :3, 3], pose[crop, :3, :3] @ middle
@@ -128,11 +156,12 @@ class ContinuousRays(IterableDataset):
             corners.append(torch.from_numpy(moved[triangles.ravel()]))
         joined = torch.cat(corners)
         if len(joined) == 0:
-            return torch.zeros(rays.shape[:2], device=self.device)
+            return torch.zeros(rays.shape[:2], device=self.device), torch.zeros(rays.shape[:2], device=self.device)
         mesh = Mesh(joined, torch.arange(len(joined)).view(-1, 3), self.device)
         pose = pose.clone()
         pose[:, :3, 3] = apart
-        return simulate.cast(mesh, pose, rays, self.sensor.max_range)
+        hits = simulate.hits(mesh, pose, rays, sensor.max_range)
+        return hits.range, hits.cosine
 
 
 class StoredImages(IterableDataset):
@@ -179,6 +208,7 @@ class StoredImages(IterableDataset):
             raise ValueError(f"queries is {queries}; it should be at most {pixels}, the pixels of {target}")
         self.archive, self.source, self.target, self.scans, self.queries = archive, source, target, scans, queries
         self.seed, self.start, self.part, self.wrap = seed, start, _part(scans, part), sensor.wrap
+        self.sensor = replace(sensor, azimuths=sensor.azimuths[:sector])
         self.sector, self.located = sector, located.reshape(-1, 2)
 
     def __iter__(self) -> Iterator[Batch]:
@@ -199,7 +229,7 @@ class StoredImages(IterableDataset):
             images.append(sparse)
             queries.append(self.located[pixels])
             ranges.append(dense.reshape(-1)[pixels])
-        return Batch(torch.stack(images), torch.stack(queries), torch.stack(ranges), self.wrap)
+        return Batch(torch.stack(images), torch.stack(queries), torch.stack(ranges), self.wrap, self.sensor)
 
 
 def _part(batch: int, part: tuple[int, int]) -> slice:

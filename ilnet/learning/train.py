@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader
 from ilnet import data, models
 from ilnet.learning import metrics
 from ilnet.scan import Pair
-from ilnet.sensor import PAPER_INPUT, PAPER_TARGET, format_size, preset
+from ilnet.sensor import PAPER_INPUT, PAPER_TARGET, Sensor, format_size, preset
 from ilnet.world import places, simulate, towns
 
 __all__ = ["PRESETS", "Preset", "Training", "learns_from_images", "train"]
@@ -34,6 +34,12 @@ VALIDATION = preset("paper-64x1024")
 # The best weights are chosen on scans of these towns, by seed. No training sees them: trainings use seed 0.
 HELD_OUT = {"town01": 1, "town03": 1, "town05": 1}
 HELD_OUT_SCANS = 4
+# Sensors that a network for any sensor is validated with as well, a quarter of their beams kept, once in each town.
+HELD_OUT_SENSORS = "hdl-64e", "os0-128", "os1-64"
+# Highest learning rate, and the gradient norm that is clipped, of networks that want their own: the likelihood is steep
+# where a network is sure, and at a rate of 1e-3 long runs collapse.
+RATES = {"iln-surfaces": 4e-4}
+LARGEST_GRADIENT = {"iln-surfaces": 10.0}
 PRECISION: Any = "bf16-mixed"
 # How many validations a training has, and the fewest and the most steps between them.
 VALIDATIONS = 20
@@ -71,7 +77,11 @@ class Preset:
 
     def arguments(self, name: str) -> dict[str, Any]:
         """Returns the preset's arguments for the model called `name`."""
-        own: dict[str, dict[str, Any]] = {"liif": {"blocks": self.blocks}, "lidar-sr": {}}
+        own: dict[str, dict[str, Any]] = {
+            "liif": {"blocks": self.blocks},
+            "lidar-sr": {},
+            "iln-surfaces": {"blocks": self.blocks // 2},
+        }
         return own.get(name, {"blocks": self.blocks, "dropout": self.dropout})
 
 
@@ -124,10 +134,16 @@ class Training(lightning.LightningModule):
         """Goes on counting from the time spent before the interruption."""
         self.begun = time.monotonic() - checkpoint["seconds"]
 
+    def transfer_batch_to_device(self, batch: Any, device: torch.device, dataloader_idx: int) -> Any:
+        """Moves the tensors of a batch; Lightning itself refuses a batch that holds a frozen dataclass, the sensor."""
+        if not isinstance(batch, data.Batch):
+            return super().transfer_batch_to_device(batch, device, dataloader_idx)
+        moved = {name: getattr(batch, name).to(device) for name in ("image", "queries", "ranges")}
+        return batch._replace(**moved)
+
     def training_step(self, batch: data.Batch, index: int) -> torch.Tensor:
-        """Returns the L1 loss of ranges scaled to [-1, 1]."""
-        predicted = self.model(batch.image, batch.queries, wrap=batch.wrap)
-        loss = (predicted - batch.ranges).abs().mean() * (2 / self.model.norm_range)
+        """Returns the loss of the model, see `Model.loss`."""
+        loss = self.model.loss(*batch)
         self.log("loss", loss, prog_bar=True)
         return loss
 
@@ -170,6 +186,7 @@ def train(
     seed: int = 0,
     archive: Path | None = None,
     target: tuple[int, int] = PAPER_TARGET.shape,
+    sensors: Sequence[Sensor] | None = None,
     probe: Sequence[Pair] = (),
     **arguments: Any,
 ) -> dict[str, float]:
@@ -187,6 +204,8 @@ def train(
         archive: Stored images to learn from instead of continuous rays; see `data.open_archive`. LiDAR-SR needs them.
         target: Size (rows, columns) of the stored images to learn from. LiDAR-SR predicts images of this size, and
             learns all of their pixels, in sectors of scans.
+        sensors: Input sensors of the continuous rays; if empty, each batch has one that is made up, see
+            `data.ContinuousRays`. By default the paper's, and for iln-surfaces any.
         probe: Pairs of an input scan and the scan to be predicted. Their figures are logged as `test/...` and decide
             nothing.
         **arguments: Arguments of the model; they override the preset's.
@@ -198,7 +217,7 @@ def train(
         ValueError: If there is no such model or preset, images are missing or of a size that does not fit, `out` holds
             an interrupted run of another kind, a process has no GPU of its own, or a loss is not finite.
     """
-    plan = _plan(name, preset_name, steps, seed, archive, target, arguments)
+    plan = _plan(name, preset_name, steps, seed, archive, target, sensors, arguments)
     start = _steps_done(out / name / "last.ckpt", plan.run)
     training, batches, scans = _build(plan, start, probe)
     return _run(plan, training, batches, scans, out, start)
@@ -224,6 +243,8 @@ class _Plan:
     per_epoch: int
     """Steps in which each stored scan is seen once."""
     target: tuple[int, int]
+    sensors: Sequence[Sensor]
+    """Of the continuous rays; any where there is none."""
     run: dict[str, Any]
     """What tells this run from others; kept in its checkpoints and beside its weights."""
 
@@ -235,6 +256,7 @@ def _plan(
     seed: int,
     archive: Path | None,
     target: tuple[int, int],
+    sensors: Sequence[Sensor] | None,
     arguments: dict[str, Any],
 ) -> _Plan:
     """Checks the arguments of `train` and completes them from the preset."""
@@ -258,8 +280,12 @@ def _plan(
     steps = steps or size.steps or size.epochs * per_epoch
     arguments = {**size.arguments(name), **arguments}
     learns_from = f"{wanted} of {archive}" if archive else "continuous rays"
-    run = {"preset": preset_name, "steps": steps, "seed": seed, "data": learns_from, **arguments}
-    return _Plan(name, size, arguments, steps, seed, stored, per_epoch, target, run)
+    if sensors is None:
+        sensors = () if name == "iln-surfaces" else (PAPER_INPUT,)
+    sensors = [sensor.upright() for sensor in sensors]
+    names = [sensor.name or format_size(sensor.shape) for sensor in sensors] or ["any"]
+    run = {"preset": preset_name, "steps": steps, "seed": seed, "data": learns_from, "sensors": names, **arguments}
+    return _Plan(name, size, arguments, steps, seed, stored, per_epoch, target, sensors, run)
 
 
 def _build(
@@ -270,16 +296,15 @@ def _build(
     lightning.seed_everything(plan.seed, verbose=False)
     model = models.create(plan.name, **plan.arguments)
     samples = _samples(plan, start, part, device)
-    output = PAPER_INPUT.resize(*plan.target) if plan.name == "lidar-sr" else VALIDATION
-    held_out: list[Pair] = [
-        (pair[0], pair[1])
+    held_out = [
+        (scan, truth)
         for town, held_out_seed in HELD_OUT.items()
-        for pair in places.held_out_scans(
-            places.town(town, held_out_seed, device), HELD_OUT_SCANS, [PAPER_INPUT, output]
-        )
+        for source, wanted, count in _validation(plan)
+        for scan, truth in places.held_out_scans(places.town(town, held_out_seed, device), count, [source, wanted])
     ]
     halve_after = [epoch * plan.per_epoch for epoch in plan.size.halve_after]
-    training = Training(model, held_out, plan.size.rate, halve_after, plan.run, probe)
+    rate = RATES.get(plan.name, plan.size.rate)
+    training = Training(model, held_out, rate, halve_after, plan.run, probe)
     number, processes = part
     numbered = [(kind, i) for kind, pairs in training.pairs.items() for i in range(number, len(pairs), processes)]
     scans: DataLoader[tuple[str, int]] = DataLoader(numbered, batch_size=None)  # type: ignore[arg-type]
@@ -306,6 +331,7 @@ def _run(
         use_distributed_sampler=False,
         val_check_interval=min(max(VALIDATE_EVERY[0], steps // VALIDATIONS), VALIDATE_EVERY[1], steps),
         num_sanity_val_steps=0,
+        gradient_clip_val=LARGEST_GRADIENT.get(plan.name),
         log_every_n_steps=READ_EVERY,
         default_root_dir=folder,
         logger=[kind(out, name=plan.name, version=f"from-step-{start}") for kind in (CSVLogger, TensorBoardLogger)],
@@ -406,13 +432,26 @@ class _Last(Checkpoint):
             trainer.save_checkpoint(self.file)
 
 
+def _validation(plan: _Plan) -> list[tuple[Sensor, Sensor, int]]:
+    """Returns the sensors that validate a training: what is seen, what is to be predicted, and of how many scans."""
+    if plan.name == "lidar-sr":
+        return [(PAPER_INPUT, PAPER_INPUT.resize(*plan.target), HELD_OUT_SCANS)]
+    others = [] if plan.sensors else [preset(name) for name in HELD_OUT_SENSORS]
+    return [
+        (PAPER_INPUT, VALIDATION, HELD_OUT_SCANS),
+        *((sensor.decimate(sensor.shape[0] // 4), sensor, 1) for sensor in others),
+    ]
+
+
 def _samples(
     plan: _Plan, start: int, part: tuple[int, int], device: torch.device
 ) -> data.ContinuousRays | data.StoredImages:
     size, target, source = plan.size, plan.target, PAPER_INPUT
     if plan.stored is None:
         streets = [places.town(town, 0, device) for town in size.towns]
-        return data.ContinuousRays(streets, source, size.crops, size.columns, size.queries, plan.seed, start, part)
+        return data.ContinuousRays(
+            streets, plan.sensors, size.crops, size.columns, size.queries, plan.seed, start, part
+        )
     columns = source.shape[1]
     if plan.name == "lidar-sr":
         # It learns all pixels that it predicts. Batch norm needs several scans, so it sees only a sector of each.

@@ -14,6 +14,7 @@ from ilnet.models.bilinear import Bilinear, Nearest, Planes
 from ilnet.models.iln import ILN
 from ilnet.models.lidar_sr import LiDARSR
 from ilnet.models.liif import LIIF
+from ilnet.models.surfaces import Surfaces
 
 __all__ = [
     "ILN",
@@ -26,6 +27,7 @@ __all__ = [
     "Model",
     "Nearest",
     "Planes",
+    "Surfaces",
     "Upsampler",
     "create",
     "load",
@@ -42,6 +44,7 @@ _MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
     "liif": (LIIF, {}),
     "lidar-sr": (LiDARSR, {}),
     "iln": (ILN, {}),
+    "iln-surfaces": (Surfaces, {}),
     "iln-prior": (ILN, {"prior": "perspective", "snap": 0.02}),
 }
 NAMES = tuple(_MODELS)

@@ -3,10 +3,8 @@
 import itertools
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import nn
 
@@ -44,12 +42,13 @@ class Model(nn.Module):
     def check_sensors(self, source: Sensor, target: Sensor) -> None:
         """Raises a ValueError if the model cannot predict what `target` would measure from scans of `source`."""
 
-    def encode(self, image: torch.Tensor, wrap: bool) -> Any:
+    def encode(self, image: torch.Tensor, wrap: bool, sensor: Sensor | None = None) -> Any:
         """Computes what all queries of an image share; the image itself if there is nothing to extract.
 
         Args:
             image: (B, H, W) metres, no return filled.
             wrap: Whether column W-1 meets column 0.
+            sensor: The sensor of the image, for models that need its angles.
 
         Returns:
             The first argument of `decode`: features (B, C, H, W), perhaps with more, or the image.
@@ -64,7 +63,9 @@ class Model(nn.Module):
         """Returns whether `decode` needs almost no memory per query, so that `Upsampler` need not cut tiles."""
         return False
 
-    def forward(self, image: torch.Tensor, queries: torch.Tensor, wrap: bool = True) -> torch.Tensor:
+    def forward(
+        self, image: torch.Tensor, queries: torch.Tensor, wrap: bool = True, sensor: Sensor | None = None
+    ) -> torch.Tensor:
         """Predicts the range along each queried direction.
 
         Args:
@@ -72,18 +73,39 @@ class Model(nn.Module):
                 lowest beam first, azimuths rising.
             queries: (B, Q, 2) float32 pixel coordinates (row, column) in that image (`Sensor.locate`).
             wrap: Whether column W-1 meets column 0 (`Sensor.wrap`).
+            sensor: The sensor of the image, for models that need its angles.
 
         Returns:
             (B, Q) float32 metres.
 
         Raises:
-            ValueError: If the shapes do not fit.
+            ValueError: If the shapes do not fit, or the model needs the sensor.
         """
         if image.ndim != 3:
             raise ValueError(f"image has shape {tuple(image.shape)}; it should be (B, H, W)")
         if queries.ndim != 3 or queries.shape[0] != len(image) or queries.shape[2] != 2:
             raise ValueError(f"queries has shape {tuple(queries.shape)}; it should be ({len(image)}, Q, 2)")
-        return self.decode(self.encode(image, wrap), image, queries, wrap)
+        return self.decode(self.encode(image, wrap, sensor), image, queries, wrap)
+
+    def loss(
+        self,
+        image: torch.Tensor,
+        queries: torch.Tensor,
+        ranges: torch.Tensor,
+        wrap: bool = True,
+        sensor: Sensor | None = None,
+    ) -> torch.Tensor:
+        """Returns what training minimises: L1 of ranges scaled to [-1, 1] (paper, Sec. III-B).
+
+        Args:
+            image: As in `forward`.
+            queries: As in `forward`.
+            ranges: (B, Q) metres that a laser would measure along the queries, no return filled.
+            wrap: As in `forward`.
+            sensor: As in `forward`.
+        """
+        predicted = self(image, queries, wrap=wrap, sensor=sensor)
+        return (predicted - ranges).abs().mean() * (2 / self.norm_range)
 
     def ranges(self, scan: Scan, sensor: Sensor, precision: str = "float32") -> torch.Tensor:
         """Predicts what `sensor` would measure at the place of a scan, as the raw output of the network.
@@ -162,7 +184,7 @@ class Upsampler:
         # Networks were trained on upright images; a sensor may store its beams and columns in either order.
         tables = {-2: source.elevations, -1: source.azimuths}
         self._flips = [axis for axis, table in tables.items() if table[0] > table[-1]]
-        upright = replace(source, elevations=np.sort(source.elevations), azimuths=np.sort(source.azimuths))
+        self._upright = upright = source.upright()
         queries = upright.grid_queries(target)
         self._seen = upright.contains(queries).to(self.device)
         self._queries = queries.view(1, -1, 2).to(self.device)
@@ -196,7 +218,7 @@ class Upsampler:
     def _answer(self, image: torch.Tensor) -> torch.Tensor:
         model, wrap = self.model, self.source.wrap
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._half):
-            encoded = model.encode(image, wrap)
+            encoded = model.encode(image, wrap, self._upright)
             count = self._queries.shape[1]
             answer = image.new_empty(1, count)
             tile = count if model.is_fused(encoded) else _TILE[self.device.type]

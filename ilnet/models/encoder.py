@@ -68,18 +68,19 @@ class Encoder(nn.Module):
     Args:
         features: Channels C of every layer.
         blocks: Number of residual blocks.
+        inputs: Channels of the image.
     """
 
-    def __init__(self, features: int = 64, blocks: int = 16):
+    def __init__(self, features: int = 64, blocks: int = 16, inputs: int = 1):
         super().__init__()
-        self.head = _Conv(1, features)
+        self.head = _Conv(inputs, features)
         self.blocks = nn.ModuleList(_ResidualBlock(features) for _ in range(blocks))
         self.tail = _Conv(features, features)
         # Convolutions are fast in this format, and it keeps the features of a pixel together for `gather_neighbours`.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, image: torch.Tensor, wrap: bool) -> torch.Tensor:
-        """Maps images (B, 1, H, W) scaled to [-1, 1] to features (B, C, H, W)."""
+        """Maps images (B, inputs, H, W), scaled to about [-1, 1], to features (B, C, H, W)."""
         head = self.head(image.to(memory_format=torch.channels_last), wrap)
         x = head
         for block in self.blocks:

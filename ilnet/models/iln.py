@@ -8,6 +8,7 @@ from torch import nn
 from ilnet.models.base import OFFSET_SCALE, Model, normalised
 from ilnet.models.bilinear import interpolate_planes
 from ilnet.models.encoder import Encoder
+from ilnet.sensor import Sensor
 from kernels import (
     DecoderWeights,
     Projected,
@@ -22,7 +23,7 @@ from kernels import (
 )
 from kernels.checks import PRIORS
 
-__all__ = ["ILN"]
+__all__ = ["ILN", "Block"]
 
 
 class _Encoded(NamedTuple):
@@ -59,13 +60,16 @@ class _FeedForward(nn.Sequential):
         )
 
 
-class _Block(nn.Module):
+class Block(nn.Module):
+    """Attention among the 4 neighbours of a query, then a feed-forward layer for each (paper, Fig. 3b)."""
+
     def __init__(self, features: int, heads: int, dropout: float):
         super().__init__()
         self.attention = _Attention(features, heads, dropout)
         self.feed_forward = _FeedForward(features, dropout)
 
     def forward(self, z: torch.Tensor, backend: str) -> torch.Tensor:
+        """Maps the tokens (..., 4, C) of queries to tokens."""
         z = z + self.attention(z, backend)
         return z + self.feed_forward(z)
 
@@ -118,14 +122,14 @@ class ILN(Model):
         self.norm_range, self.dropout = norm_range, dropout
         self.encoder = Encoder(features, blocks)
         self.position = nn.Linear(2, features)
-        self.blocks = nn.ModuleList(_Block(features, heads, dropout) for _ in range(depth))
+        self.blocks = nn.ModuleList(Block(features, heads, dropout) for _ in range(depth))
         score = nn.Linear(features, 1)
         if prior != "none":
             nn.init.zeros_(score.weight)
             nn.init.zeros_(score.bias)
         self.head = nn.Sequential(nn.LayerNorm(features), score)
 
-    def encode(self, image: torch.Tensor, wrap: bool) -> _Encoded:
+    def encode(self, image: torch.Tensor, wrap: bool, sensor: Sensor | None = None) -> _Encoded:
         """Extracts features z from ranges (B, H, W) [m] and projects them for the first attention."""
         z = self.encoder(normalised(image, self.norm_range), wrap)
         if len(self.blocks) == 0 or (self.training and self.dropout > 0):
@@ -172,9 +176,9 @@ class ILN(Model):
         projected, inference = encoded.projected, self.backend == "warp" and not torch.is_grad_enabled()
         return projected is not None and inference and len(self.blocks) == 1 and fused_decode_serves(projected)
 
-    def _first(self) -> _Block:
+    def _first(self) -> Block:
         block = self.blocks[0]
-        assert isinstance(block, _Block)
+        assert isinstance(block, Block)
         return block
 
     def _decoder_weights(self) -> DecoderWeights:

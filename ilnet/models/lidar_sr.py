@@ -93,7 +93,7 @@ class LiDARSR(Model):
         if away.max() > 0.5:
             raise ValueError(f"{what}, evenly over its field of view; {target} looks elsewhere")
 
-    def encode(self, image: torch.Tensor, wrap: bool) -> torch.Tensor:
+    def encode(self, image: torch.Tensor, wrap: bool, sensor: Sensor | None = None) -> torch.Tensor:
         """Returns the denser image (B, H·rows, W·columns) [m] of ranges (B, H, W) [m], which it scales to [0, 1]."""
         x = self.widen((image.clamp(max=self.norm_range) / self.norm_range).unsqueeze(1))
         before = []

@@ -7,6 +7,7 @@ from torch import nn
 
 from ilnet.models.base import OFFSET_SCALE, Model, normalised
 from ilnet.models.encoder import Encoder
+from ilnet.sensor import Sensor
 from kernels import area_blend, gather_neighbours
 
 __all__ = ["LIIF"]
@@ -33,7 +34,7 @@ class LIIF(Model):
         layers = [layer for a, b in pairwise(widths) for layer in (nn.Linear(a, b), nn.ReLU())]
         self.value = nn.Sequential(*layers, nn.Linear(hidden, 1))
 
-    def encode(self, image: torch.Tensor, wrap: bool) -> torch.Tensor:
+    def encode(self, image: torch.Tensor, wrap: bool, sensor: Sensor | None = None) -> torch.Tensor:
         """Extracts features z (B, C, H, W) from ranges (B, H, W) [m], scaled to [-1, 1]."""
         return self.encoder(normalised(image, self.norm_range), wrap)
 

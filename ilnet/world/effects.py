@@ -20,7 +20,7 @@ from ilnet.scan import Scan
 from ilnet.sensor import Sensor, angles_to_directions
 from kernels import Mesh
 
-__all__ = ["RANGE_RESOLUTION", "REFERENCE_RANGE", "Effects", "nearer", "simulate_with"]
+__all__ = ["RANGE_RESOLUTION", "REFERENCE_RANGE", "Effects", "nearer", "simulate_with", "spoil"]
 
 RANGE_RESOLUTION = 0.5
 """Least distance between two returns of a beam [m]: half the length of a pulse of 3.3 ns."""
@@ -47,6 +47,7 @@ class Effects:
         range_noise: Standard deviation of the range [m], the same near and far.
         range_noise_growth: Standard deviation added per metre of range [m/m]. At range r the noise is Gaussian with the
             standard deviation `range_noise + range_noise_growth * r`.
+        dropout: Probability of losing any return, whatever it comes from: dust, interference, a lost packet.
         dropout_range: Probability of losing a return at the sensor's maximum range R; at r it is
             `dropout_range * (r / R)**2`.
         dropout_incidence: Probability of losing a return from a surface seen edge-on; where c is the cosine between
@@ -67,6 +68,7 @@ class Effects:
 
     range_noise: float = 0.0
     range_noise_growth: float = 0.0
+    dropout: float = 0.0
     dropout_range: float = 0.0
     dropout_incidence: float = 0.0
     intensity: bool = False
@@ -81,6 +83,7 @@ class Effects:
         for name, most, meaning in (
             ("range_noise", math.inf, "a standard deviation [m]"),
             ("range_noise_growth", math.inf, "metres of standard deviation per metre of range"),
+            ("dropout", 1.0, "a probability"),
             ("dropout_range", 1.0, "a probability"),
             ("dropout_incidence", 1.0, "a probability"),
             ("divergence", _MOST_DIVERGENCE, "an angle in radians; real beams have some thousandths"),
@@ -151,13 +154,38 @@ def simulate_with(
         images.append(_report(ranges.where(ranges >= sensor.min_range, 0.0), cosines, effects.returns))
     ranges, cosines, energy = (torch.cat(image) for image in zip(*images, strict=True))
 
+    ranges = spoil(effects, ranges, cosines, sensor, noise.to(device), luck.to(device))
+    intensity = (energy * (REFERENCE_RANGE**2 / len(pattern))).clamp(max=1.0) if effects.intensity else None
+    return Scan(ranges, sensor, intensity)
+
+
+def spoil(
+    effects: Effects,
+    ranges: torch.Tensor,
+    cosines: torch.Tensor,
+    sensor: Sensor,
+    noise: torch.Tensor,
+    luck: torch.Tensor,
+) -> torch.Tensor:
+    """Adds noise to ranges and loses some of them.
+
+    Args:
+        effects: Range noise and the three dropouts; the others happen as rays are cast.
+        ranges: (...) clean ranges [m], 0 where nothing returned.
+        cosines: (...) of the angle between beam and surface normal.
+        sensor: The sensor that measures; what falls outside its range limits is no return.
+        noise: (...) numbers from a normal distribution.
+        luck: (...) numbers from 0 to 1; where one is small, the return is lost.
+
+    Returns:
+        (...) ranges [m], 0 where nothing returned.
+    """
     lost_far = effects.dropout_range * (ranges / sensor.max_range) ** 2
     lost_grazing = effects.dropout_incidence * (1 - cosines) ** 2
-    seen = (ranges > 0) & (luck.to(device) >= 1 - (1 - lost_far) * (1 - lost_grazing))
-    ranges = ranges + noise.to(device) * (effects.range_noise + effects.range_noise_growth * ranges)
+    seen = (ranges > 0) & (luck >= 1 - (1 - effects.dropout) * (1 - lost_far) * (1 - lost_grazing))
+    ranges = ranges + noise * (effects.range_noise + effects.range_noise_growth * ranges)
     seen &= (ranges >= sensor.min_range) & (ranges > 0) & (ranges <= sensor.max_range)
-    intensity = (energy * (REFERENCE_RANGE**2 / len(pattern))).clamp(max=1.0) if effects.intensity else None
-    return Scan(ranges.where(seen, 0.0), sensor, intensity)
+    return ranges.where(seen, 0.0)
 
 
 def _beams(

@@ -18,7 +18,7 @@ from ilnet.sensor import Sensor
 from ilnet.world import meshes, simulate, towns
 from kernels import Mesh
 
-__all__ = ["ARCHIVE_JITTER", "RAYS_JITTER", "Jitter", "Place", "held_out_scans", "mesh", "town"]
+__all__ = ["ANY_JITTER", "ARCHIVE_JITTER", "RAYS_JITTER", "Jitter", "Place", "held_out_scans", "mesh", "town"]
 
 
 class Jitter(NamedTuple):
@@ -33,6 +33,8 @@ class Jitter(NamedTuple):
 # Archives on disk and the shipped weights were made with these values; another value would change what they mean.
 RAYS_JITTER = Jitter(0.3, math.radians(2.0))
 """Jitter of the crops that networks learn from, see `ilnet.data.ContinuousRays`."""
+ANY_JITTER = Jitter(0.7, math.radians(5.0))
+"""Jitter of the same crops for a network that serves any sensor: on cars, robots and poles, and not quite upright."""
 ARCHIVE_JITTER = Jitter(0.1, math.radians(1.0))
 """Jitter of the scans in an archive, see `ilnet.data.generate`."""
 

@@ -8,9 +8,9 @@ import torch
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 from ilnet.world.effects import Effects, nearer, simulate_with
-from kernels import Mesh
+from kernels import Hits, Mesh
 
-__all__ = ["World", "best_device", "cast", "nearest", "pose", "ranges", "scan"]
+__all__ = ["World", "best_device", "cast", "hits", "nearest", "pose", "ranges", "scan"]
 
 Angle = float | torch.Tensor
 # One mesh or several: a town, and the traffic in it.
@@ -54,6 +54,11 @@ def pose(
 
 
 def cast(mesh: Mesh, pose: torch.Tensor, directions: torch.Tensor, max_range: float) -> torch.Tensor:
+    """Returns the ranges (..., N) [m] of `hits`, whose arguments it takes; 0 where nothing is met."""
+    return hits(mesh, pose, directions, max_range).range
+
+
+def hits(mesh: Mesh, pose: torch.Tensor, directions: torch.Tensor, max_range: float) -> Hits:
     """Casts rays along any directions.
 
     Args:
@@ -63,11 +68,11 @@ def cast(mesh: Mesh, pose: torch.Tensor, directions: torch.Tensor, max_range: fl
         max_range: Greatest range that is found [m].
 
     Returns:
-        (..., N) float32 ranges [m] on the mesh's device; 0 where nothing is met.
+        The nearest hits, each tensor (..., N), on the mesh's device.
     """
     pose = pose.to(mesh.device)
     turned = directions.to(mesh.device).double() @ pose[..., :3, :3].mT
-    return mesh.cast(pose[..., None, :3, 3], turned, max_range).range
+    return mesh.cast(pose[..., None, :3, 3], turned, max_range)
 
 
 def nearest(found: Sequence[torch.Tensor]) -> torch.Tensor:

@@ -88,9 +88,9 @@ def test_continuous_rays_meet_the_traffic_of_their_own_crop(monkeypatch):
     """What crops measure is what one crop alone measures in the world it stands in."""
     street = places.town("town01")
     drawn, casts = [], []
-    draw, cast = places.towns.traffic, simulate.cast
+    draw, cast, hits = places.towns.traffic, simulate.cast, simulate.hits
     monkeypatch.setattr(places.towns, "traffic", lambda *args, **sector: drawn.append(args) or draw(*args, **sector))
-    monkeypatch.setattr(simulate, "cast", lambda *args: casts.append(args) or cast(*args))
+    monkeypatch.setattr(simulate, "hits", lambda *args: casts.append(args) or hits(*args))
     batch = next(iter(data.ContinuousRays([street], SENSOR, crops=5, columns=96, queries=300, seed=3)))
     monkeypatch.undo()
     assert len({seed for _, _, seed in drawn}) == 5

@@ -1,5 +1,6 @@
 import csv
 import dataclasses
+import json
 import os
 import subprocess
 import sys
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from torch.utils.data import get_worker_info
 
 from ilnet import data, models
@@ -27,7 +29,12 @@ def quick(monkeypatch, quiet_place):
     monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
     size = train.Preset(blocks=1, steps=4, crops=2, columns=32, queries=64, towns=("town01",))
     monkeypatch.setitem(train.PRESETS, "tiny", size)
-    return lambda out, **options: train.train("iln-prior", "tiny", out, features=16, heads=4, **options)
+    monkeypatch.setattr(train, "HELD_OUT_SENSORS", ("os1-32",))
+
+    def run(out, name="iln-prior", **options):
+        return train.train(name, "tiny", out, **{"features": 16, "heads": 4, **options})
+
+    return run
 
 
 def test_writes_weights_that_load_and_figures(tmp_path, quick):
@@ -46,6 +53,41 @@ def test_the_same_seed_gives_the_same_weights(tmp_path, quick):
         weights.append(models.load(tmp_path / str(number) / "iln-prior.safetensors").state_dict())
     assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
     assert not torch.equal(weights[0]["position.weight"], weights[2]["position.weight"])
+
+
+def test_surfaces_learn_from_any_sensor_by_default(tmp_path, quick, monkeypatch):
+    seen = []
+    draw = data.ContinuousRays._draw
+    monkeypatch.setattr(data.ContinuousRays, "_draw", lambda self, n: seen.append(draw(self, n)) or seen[-1])
+    quick(tmp_path, "iln-surfaces", tokens=8, steps=6)
+    assert len({batch.sensor for batch in seen}) > 2
+    with safe_open(tmp_path / "iln-surfaces.safetensors", "pt") as file:
+        assert json.loads(file.metadata()["sensors"]) == ["any"]
+    assert isinstance(models.load(tmp_path / "iln-surfaces.safetensors"), models.Surfaces)
+
+
+def test_the_sensors_of_a_training_can_be_chosen(tmp_path, quick):
+    quick(tmp_path, "iln-surfaces", tokens=8, sensors=[preset("os1-32")])
+    with safe_open(tmp_path / "iln-surfaces.safetensors", "pt") as file:
+        assert json.loads(file.metadata()["sensors"]) == ["os1-32"]
+
+
+def test_a_training_on_any_sensor_goes_on_exactly(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(train, "CHECKPOINT_EVERY", 2)
+    options = {"name": "iln-surfaces", "tokens": 8, "steps": 4}
+    whole = quick(tmp_path / "whole", **options)
+    draw = data.ContinuousRays._draw
+
+    def killed(self, number):
+        if number == 3:
+            raise RuntimeError("cut")
+        return draw(self, number)
+
+    monkeypatch.setattr(data.ContinuousRays, "_draw", killed)
+    with pytest.raises(RuntimeError, match="cut"):
+        quick(tmp_path / "cut", **options)
+    monkeypatch.setattr(data.ContinuousRays, "_draw", draw)
+    assert quick(tmp_path / "cut", **options) == whole
 
 
 def test_a_worker_makes_the_batches_where_cores_are_to_spare(tmp_path, quick, monkeypatch):

@@ -216,7 +216,7 @@ def test_blends_stay_between_the_neighbours():
     assert (ranges <= gathered.amax((-1, -2)) + METRES).all()
 
 
-@pytest.mark.parametrize("name", ["nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln"])
+@pytest.mark.parametrize("name", ["nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-surfaces"])
 def test_upsample_to_any_sensor(name, yard):
     torch.manual_seed(0)
     arguments = {"features": 16, "blocks": 1} if name in models.TRAINABLE else {}
@@ -539,7 +539,7 @@ def test_a_scan_without_returns_gives_none():
         assert not model.upsample(empty, sensor.resize(20, 100)).ranges.any()
 
 
-@pytest.mark.parametrize("name", [name for name in models.NAMES if name != "lidar-sr"])
+@pytest.mark.parametrize("name", [name for name in models.NAMES if name not in ("lidar-sr", "iln-surfaces")])
 def test_shipped_models_load_and_predict(name, yard):
     model = models.load(name)
     scan = simulate.scan(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
