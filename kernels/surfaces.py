@@ -404,22 +404,25 @@ def _rays(
     return {**tensors, "wrap": int(wrap)}
 
 
+def _empty_hypotheses(image: torch.Tensor, queries: torch.Tensor, *_: Any) -> torch.Tensor:
+    return image.new_empty(*queries.shape[:2], 4, KINDS)
+
+
 @torch.library.custom_op("kernels::surface_hypotheses", mutates_args=())
 def _surface_hypotheses(
     image: torch.Tensor, queries: torch.Tensor, elevations: torch.Tensor, azimuths: torch.Tensor, wrap: bool
 ) -> torch.Tensor:
-    batch, count, _ = queries.shape
-    found = image.new_empty(batch, count, 4, KINDS)
+    found = _empty_hypotheses(image, queries)
     inputs = [_rays(image, queries, elevations, azimuths, wrap)]
-    launch(_found[image.dtype], batch * count, inputs, [found])
+    launch(_found[image.dtype], queries[..., 0].numel(), inputs, [found])
     return found
 
 
-@_surface_hypotheses.register_fake
-def _(
-    image: torch.Tensor, queries: torch.Tensor, elevations: torch.Tensor, azimuths: torch.Tensor, wrap: bool
-) -> torch.Tensor:
-    return image.new_empty(queries.shape[0], queries.shape[1], 4, KINDS)
+_surface_hypotheses.register_fake(_empty_hypotheses)
+
+
+def _empty_likelihood(image: torch.Tensor, queries: torch.Tensor, *_: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    return image.new_empty(queries.shape[:2]), image.new_empty(queries.shape[:2])
 
 
 @torch.library.custom_op("kernels::surface_likelihood", mutates_args=())
@@ -434,25 +437,17 @@ def _surface_likelihood(
     targets: torch.Tensor,
     far: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    likelihood, error = torch.empty_like(targets), torch.empty_like(targets)
+    likelihood, error = _empty_likelihood(image, queries)
     inputs = [_rays(image, queries, elevations, azimuths, wrap), scores, scales, targets, far]
     launch(_likelihood[image.dtype], targets.numel(), inputs, [likelihood, error])
     return likelihood, error
 
 
-@_surface_likelihood.register_fake
-def _(
-    image: torch.Tensor,
-    queries: torch.Tensor,
-    elevations: torch.Tensor,
-    azimuths: torch.Tensor,
-    wrap: bool,
-    scores: torch.Tensor,
-    scales: torch.Tensor,
-    targets: torch.Tensor,
-    far: float,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    return torch.empty_like(targets), torch.empty_like(targets)
+_surface_likelihood.register_fake(_empty_likelihood)
+
+
+def _empty_gradients(image: torch.Tensor, queries: torch.Tensor, *_: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    return image.new_empty(*queries.shape[:2], 4, KINDS), image.new_empty(*queries.shape[:2], 4)
 
 
 @torch.library.custom_op("kernels::surface_likelihood_backward", mutates_args=())
@@ -469,7 +464,7 @@ def _surface_likelihood_backward(
     adj_likelihood: torch.Tensor,
     adj_error: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    adj_scores, adj_scales = torch.empty_like(scores), torch.empty_like(scales)
+    adj_scores, adj_scales = _empty_gradients(image, queries)
     inputs = [
         _rays(image, queries, elevations, azimuths, wrap),
         scores,
@@ -483,21 +478,7 @@ def _surface_likelihood_backward(
     return adj_scores, adj_scales
 
 
-@_surface_likelihood_backward.register_fake
-def _(
-    image: torch.Tensor,
-    queries: torch.Tensor,
-    elevations: torch.Tensor,
-    azimuths: torch.Tensor,
-    wrap: bool,
-    scores: torch.Tensor,
-    scales: torch.Tensor,
-    targets: torch.Tensor,
-    far: float,
-    adj_likelihood: torch.Tensor,
-    adj_error: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    return torch.empty_like(scores), torch.empty_like(scales)
+_surface_likelihood_backward.register_fake(_empty_gradients)
 
 
 def _setup_context(ctx: Any, inputs: tuple, output: tuple) -> None:
@@ -517,6 +498,13 @@ def _backward(ctx: Any, adj_likelihood: torch.Tensor, adj_error: torch.Tensor) -
 _surface_likelihood.register_autograd(_backward, setup_context=_setup_context)
 
 
+def _empty_answers(
+    image: torch.Tensor, queries: torch.Tensor, *_: Any
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    shape = queries.shape[:2]
+    return image.new_empty(shape), image.new_empty(shape), image.new_empty(shape)
+
+
 @torch.library.custom_op("kernels::surface_median", mutates_args=())
 def _surface_median(
     image: torch.Tensor,
@@ -527,25 +515,13 @@ def _surface_median(
     scores: torch.Tensor,
     scales: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    shape = queries.shape[:2]
-    ranges, confidence, none = image.new_empty(shape), image.new_empty(shape), image.new_empty(shape)
+    ranges, confidence, none = _empty_answers(image, queries)
     inputs = [_rays(image, queries, elevations, azimuths, wrap), scores, scales]
     launch(_median[image.dtype], ranges.numel(), inputs, [ranges, confidence, none])
     return ranges, confidence, none
 
 
-@_surface_median.register_fake
-def _(
-    image: torch.Tensor,
-    queries: torch.Tensor,
-    elevations: torch.Tensor,
-    azimuths: torch.Tensor,
-    wrap: bool,
-    scores: torch.Tensor,
-    scales: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    shape = queries.shape[:2]
-    return image.new_empty(shape), image.new_empty(shape), image.new_empty(shape)
+_surface_median.register_fake(_empty_answers)
 
 
 for _op in (_surface_hypotheses, _surface_likelihood, _surface_median):
