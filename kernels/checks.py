@@ -15,6 +15,7 @@ __all__ = [
     "BACKENDS",
     "BACKGROUND",
     "CONTINUED",
+    "FARTHEST",
     "KINDS",
     "LEAST_RANGE",
     "LEAST_SCALE",
@@ -57,6 +58,8 @@ LEAST_RANGE = 0.01
 LEAST_SCALE = 0.02
 # Radians. No surface is continued over a wider gap.
 WIDEST_GAP = 0.5
+# Pixels. The attention step takes a coordinate farther out as this far, so that squares of offsets stay finite.
+FARTHEST = 2.0**30
 # Metres within which a range counts as right in a confidence.
 TOLERANCE = 0.1
 

@@ -13,6 +13,7 @@ from kernels.checks import (
     AREA_FLOOR,
     BACKGROUND,
     CONTINUED,
+    FARTHEST,
     LEAST_RANGE,
     LEAST_SCALE,
     PARTED,
@@ -128,7 +129,7 @@ def neighbour_attention(
 ) -> torch.Tensor:
     """`kernels.neighbour_attention` on the tensors of a `Projected`, queries (B, Q, 2) and a weight for [d][head]."""
     channels = len(bias)
-    gathered, q = gather_neighbours(pixels.movedim(3, 1), queries, wrap)
+    gathered, q = gather_neighbours(pixels.movedim(3, 1), queries.clamp(-FARTHEST, FARTHEST), wrap)
     a, squares, u, _ = gathered.split([4 * channels, 1, 2, gathered.shape[-1] - 4 * channels - 3], -1)
     qkv, tokens = (a + q @ slope).split([3 * channels, channels], -1)
     sums = squares + 2 * (q * u).sum(-1, keepdim=True) + ((q @ gram) * q).sum(-1, keepdim=True)

@@ -1,4 +1,14 @@
-"""The attention step among the 4 neighbours of a query, and the whole decoder of ILN."""
+"""The attention step among the 4 neighbours of a query (paper, Fig. 3b), and the whole decoder of ILN built on it.
+
+Read in this order:
+
+- `op`: `neighbour_attention`, the step as a differentiable op. It chooses between the two sets of kernels below.
+- `table`: `project_pixels`, the part of the step that is done once for each pixel, in plain PyTorch.
+- `maths`: the derivation, and the functions that all kernels share.
+- `heads`: kernels whose threads take one head of one query. For CUDA, float64 and any number of channels.
+- `vectors`: kernels whose threads take all heads of a query, as vectors. For CPUs, float32 and the paper's 8 heads.
+- `decoder`: `fused_decode`, the step and all that follows it up to the range. For inference on CPUs.
+"""
 
 from kernels.neighbour_attention.decoder import DecoderWeights, fused_decode, fused_decode_serves
 from kernels.neighbour_attention.op import neighbour_attention

@@ -1,14 +1,16 @@
-"""fused_decode: the whole decoder of ILN at depth 1 on CPU cores, from the table of pixels to the range of each query.
+"""fused_decode: the whole decoder of ILN at depth 1 on CPUs, from the table of pixels to the range of each query.
 
-    t = z + Wq + b                           per neighbour of the query
+    t = z + Wq + b                           for each of the 4 neighbours
     t ← t + O attend(M LN(t))                `kernels.neighbour_attention.maths`
     t ← t + W₂ gelu(W₁ LN(t) + b₁) + b₂
     s = hᵀ LN(t),   r̂ = Σ_t softmax(s + p)_t r_t
 
-A frame of 128×2048 queries has a million tokens of 64 numbers, and the decoder passes over them a dozen times: done one
-operation after the other, it waits for memory. Here a thread takes some queries at a time through all operations; their
-tokens stay in the cache of its core, and only ranges are written. γ and β of the norms are multiplied into the weights
-behind them; what adds the same to the scores of all 4 neighbours, such as the bias of the head, does not change them.
+A frame of 128×2048 queries has a million tokens of 64 numbers, and the decoder passes over them a dozen times. One
+operation after the other, it would wait for memory. Here a thread takes a few queries at a time through all operations:
+their tokens stay in the cache of its core, and only ranges are written.
+
+γ and β of the layer norms are multiplied into the weights behind them. Terms that are the same for all 4 neighbours,
+such as the bias of the score, are left out, since the softmax does not depend on them.
 """
 
 from typing import Any, NamedTuple
@@ -28,8 +30,8 @@ from kernels.vmap import refuse
 
 __all__ = ["DecoderWeights", "fused_decode", "fused_decode_serves"]
 
-# Threads that share the queries, and how many queries each takes at a time: their tokens fit the cache of a core, and a
-# layer's weights are read from its fastest part for all of them.
+# Threads among which the queries are split, and how many queries a thread takes at a time. The tokens of so many fit
+# the cache of a core, and it reads each layer's weights once for all of them.
 _WORKERS = 64
 _GROUP = wp.constant(16)
 
@@ -43,7 +45,7 @@ _pixel_table: Any = PIXEL_TABLES[_lanes]
 
 @wp.func
 def _normalise(x: wp.array2d[_lanes], row: int, eps: float, y_out: wp.array2d[_lanes]):
-    """LayerNorm of a row, without its weight and bias."""
+    """Layer norm of a row, without weight and bias."""
     channels = float(LANES * x.shape[1])
     sums = _lanes()
     for c in range(x.shape[1]):
@@ -64,7 +66,7 @@ def _normalise(x: wp.array2d[_lanes], row: int, eps: float, y_out: wp.array2d[_l
 @wp.func
 def _blend(scores: wp.vec4, ranges: wp.vec4, row: float, column: float, prior: int, area_floor: float):
     """softmax(s + p) · r, as in `kernels.gather_blend`."""
-    factor = wp.vec4(1.0, 1.0, 1.0, 1.0)  # exp(p), so that neither 0 nor its logarithm is special
+    factor = wp.vec4(1.0, 1.0, 1.0, 1.0)  # exp(p) instead of p: an area of 0 needs no logarithm
     largest = float(-wp.inf)
     for t in range(4):
         if prior >= _BILINEAR:
@@ -81,30 +83,30 @@ def _blend(scores: wp.vec4, ranges: wp.vec4, row: float, column: float, prior: i
 
 @wp.struct
 class _Scratch:
-    """Memory of the threads: rows 4·_GROUP·i and the following belong to thread i."""
+    """Memory of the threads: each has 4·_GROUP rows, one for each neighbour of its queries."""
 
     tokens: wp.array2d[_lanes]
-    """(4·_GROUP·threads, blocks): t."""
+    """(rows, blocks): t."""
     x: wp.array2d[_lanes]
-    """(4·_GROUP·threads, blocks): what a layer reads."""
+    """(rows, blocks): the input of the next layer."""
     x_scalars: wp.array2d[float]
-    """(4·_GROUP·threads, C): the same memory, number by number."""
+    """(rows, C): the same memory, number by number."""
     h: wp.array2d[_lanes]
-    """(4·_GROUP·threads, blocks): the hidden layer."""
+    """(rows, blocks): the hidden layer."""
     h_scalars: wp.array2d[float]
-    """(4·_GROUP·threads, C): the same memory, number by number."""
+    """(rows, C): the same memory, number by number."""
 
 
 @wp.struct
 class _Blend:
-    """What scores become ranges with."""
+    """What turns scores into a range."""
 
     image: wp.array[float]
-    """(B·H·W,): r, metres."""
+    """(B·H·W,): ranges r, metres."""
     added: wp.array2d[float]
-    """(B·Q, 4) to add to the scores, or none."""
+    """(B·Q, 4): added to the scores; without rows, nothing is."""
     prior: int
-    """Number of the prior in `PRIORS`."""
+    """Index of the prior in `PRIORS`."""
     area_floor: float
     """Least bilinear area in the prior."""
 
@@ -123,14 +125,14 @@ def _fused_decode_kernel(
     scratch_out: _Scratch,
     blended_out: wp.array[float],
 ):
-    worker = first + wp.tid()
+    thread = first + wp.tid()
     tokens = scratch_out.tokens
     x = scratch_out.x
     h = scratch_out.h
     blocks = biases.shape[1]
-    row = worker * 4 * _GROUP
-    last = wp.min((worker + 1) * share, queries.shape[0])
-    for begin in range(worker * share, last, _GROUP):
+    row = thread * 4 * _GROUP
+    last = wp.min((thread + 1) * share, queries.shape[0])
+    for begin in range(thread * share, last, _GROUP):
         end = wp.min(begin + _GROUP, last)
         stop = row + 4 * (end - begin)
         for n in range(begin, end):
@@ -172,20 +174,24 @@ def _fused_decode_kernel(
 
 
 class DecoderWeights(NamedTuple):
-    """Weights of the decoder behind the first projection; shapes as in `torch.nn`, (out, in)."""
+    """Weights of the decoder after the attention of its first step; shapes (out, in) as in `torch.nn`."""
 
     output: tuple[torch.Tensor, torch.Tensor]
-    """O (C, C) and its bias."""
+    """O (C, C) and its bias (C,)."""
     norm: tuple[torch.Tensor, torch.Tensor]
     """Weight and bias (C,) of the feed-forward's layer norm."""
     hidden: tuple[torch.Tensor, torch.Tensor]
-    """W₁ (C, C) and b₁."""
+    """W₁ (C, C) and b₁ (C,)."""
     back: tuple[torch.Tensor, torch.Tensor]
-    """W₂ (C, C) and b₂."""
+    """W₂ (C, C) and b₂ (C,)."""
     head_norm: tuple[torch.Tensor, torch.Tensor]
     """Weight and bias (C,) of the head's layer norm."""
     score: tuple[torch.Tensor, torch.Tensor]
-    """h (1, C) and its bias."""
+    """h (1, C) and its bias (1,)."""
+
+    def named(self) -> dict[str, torch.Tensor]:
+        """Returns the tensors by the names that errors give them."""
+        return {f"weights.{name}[{i}]": pair[i] for name, pair in self._asdict().items() for i in range(2)}
 
 
 def fused_decode_serves(projected: Projected) -> bool:
@@ -257,18 +263,20 @@ def fused_decode(
     eps: float = 1e-5,
     backend: str = "warp",
 ) -> torch.Tensor:
-    """Answers queries with ranges: attention, feed-forward, scores and blend in one pass. For inference: no gradients.
+    """Predicts the range of each query: attention, feed-forward, scores and blend in one pass.
+
+    It is for inference and gives no gradients.
 
     Args:
-        projected: `project_pixels` of the features; see `fused_decode_serves`.
+        projected: The features after `project_pixels`; `fused_decode_serves` says which are served.
         image: (B, H, W) float32 ranges in metres, no return filled.
-        queries: (B, Q, 2) pixel coordinates (row, column).
-        weights: The decoder's.
+        queries: (B, Q, 2) pixel coordinates (row, column). Those beyond ±2^30 count as ±2^30.
+        weights: Weights of the decoder.
         prior: As in `gather_blend`.
         wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
         area_floor: As in `gather_blend`.
-        added: (B, Q, 4) to add to the scores, such as `plane_prior`.
-        eps: Of the layer norms.
+        added: (B, Q, 4) scores of your own, such as `plane_prior`; they are added to the decoder's.
+        eps: ε of the layer norms.
         backend: "warp", or "torch" for the plain twin in `kernels.reference`, which serves any table.
 
     Returns:
@@ -284,8 +292,8 @@ def fused_decode(
     if prior not in PRIORS:
         raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}")
     check_queries(queries)
-    check_devices(projected=projected.pixels, image=image, queries=queries, output=weights.output[0])
-    check_devices(projected=projected.pixels, **({} if added is None else {"added": added}))
+    tensors = {"image": image, "queries": queries} | ({} if added is None else {"added": added})
+    check_devices(**projected.named(), **tensors, **weights.named())
     batch, height, width, _ = projected.pixels.shape
     if image.shape != (batch, height, width):
         raise ValueError(f"image has shape {tuple(image.shape)}; it should be {(batch, height, width)}")
@@ -296,11 +304,15 @@ def fused_decode(
     if backend == "torch":
         return reference.fused_decode(projected, image, queries, weights, prior, wrap, area_floor, added, eps)
     if not fused_decode_serves(projected):
-        raise ValueError("projected has no kernel: it should be float32 on a CPU, with 8 heads and C a multiple of 64")
+        pixels, heads, channels = projected.pixels, projected.heads, len(projected.shift) // 3
+        raise ValueError(
+            f"projected is {pixels.dtype} on {pixels.device} with {heads} heads and {channels} channels; it should be "
+            f"torch.float32 on cpu with {HEADS} heads and a multiple of 64 channels, or backend='torch'"
+        )
     pixels, slope, shift, gram, heads = projected
     with torch.no_grad(), torch.autocast(pixels.device.type, enabled=False):
         (gamma, beta), (w1, b1), (head_gamma, _) = weights.norm, weights.hidden, weights.head_norm
-        output = weights.output[0][:, head_last(len(beta), heads, pixels.device)]
+        output = head_last(weights.output[0], heads)
         matrices = torch.stack((output.T, (w1 * gamma).T, weights.back[0].T)).float()
         rows = torch.stack(
             (weights.output[1], w1 @ beta + b1, weights.back[1], weights.score[0][0] * head_gamma)

@@ -1,4 +1,8 @@
-"""neighbour_attention with one head of one query in a thread: for GPUs, float64 and other numbers of channels."""
+"""Kernels of neighbour_attention whose threads take one head of one query: for CUDA, float64 and any C.
+
+A vector of lanes has one component here (`kernels.lanes`), and each head is a group of its own. Neighbouring threads
+take the heads of one query, so that they read neighbouring channels. They leave to `op` what sums over heads or tokens.
+"""
 
 from typing import Any
 
@@ -12,7 +16,7 @@ __all__ = ["ATTEND", "ATTEND_BACKWARD"]
 
 
 def _kernels(scalar: type) -> tuple[wp.Kernel, wp.Kernel]:
-    """The forward and the backward kernel that compute with a type of scalar."""
+    """Returns the forward and the backward kernel for float32 or float64."""
     lane = vectors(1, scalar)
     pixel_table: Any = PIXEL_TABLES[lane]
 

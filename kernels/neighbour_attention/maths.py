@@ -29,11 +29,11 @@ from typing import Any
 
 import warp as wp
 
+from kernels.checks import FARTHEST
 from kernels.lanes import LANES, exp2, fold, total, vectors, zeros4, zeros16
 from kernels.stencil import Grid, neighbour, offset
 
 __all__ = [
-    "FARTHEST",
     "MOMENTS",
     "PIXEL_TABLES",
     "ROLLED_FOUR",
@@ -46,12 +46,11 @@ __all__ = [
 # Columns in a row of the table after q, k, v and z: xᵀx, u, and padding to a cache line.
 MOMENTS = 16
 
+_FARTHEST = wp.constant(FARTHEST)
+
 # A 4 that the compiler does not know, since it reaches a kernel at run time. Loops over `range(rolled_four)` stay
 # loops: when they are unrolled, they take long to compile and become fewer SIMD instructions.
 ROLLED_FOUR = 4
-
-# Pixels. A coordinate farther out counts as this far, so that the square of an offset is finite in float32.
-FARTHEST = 2.0**30
 
 
 def _stencil_type(scalar: Any) -> Any:
@@ -133,7 +132,7 @@ def _empty_stencil(like: wp.float64):
 @wp.func
 def _within(coordinate: Any):
     """A coordinate no farther out than `FARTHEST`; NaN stays."""
-    farthest = type(coordinate)(FARTHEST)
+    farthest = type(coordinate)(_FARTHEST)
     coordinate = wp.where(coordinate > farthest, farthest, coordinate)
     return wp.where(coordinate < -farthest, -farthest, coordinate)
 

@@ -1,7 +1,8 @@
-"""neighbour_attention: a whole pre-norm attention step among the 4 neighbours (paper, Fig. 3b).
+"""neighbour_attention: a whole pre-norm attention step among the 4 neighbours of each query (paper, Fig. 3b).
 
-`maths` derives it. On a CPU `vectors` does the whole step; elsewhere `heads` does, and leaves the output projection to
-torch. Nothing is kept for the backward pass but the inputs.
+`kernels.neighbour_attention.maths` derives it. Where `vectors` fits, its kernel does the whole step. Elsewhere the
+kernel of `heads` gathers and attends, and torch does the output projection. Only the inputs are kept for the backward
+pass.
 """
 
 from typing import Any
@@ -148,33 +149,34 @@ def neighbour_attention(
 ) -> torch.Tensor:
     """Gathers the 4 neighbours of each query, embeds the offsets, and lets the neighbours attend to each other.
 
-    Equal to x + linear(attend_neighbours(linear(layer_norm(x), M), heads), O) of x = z + Wq + b with z and q from
-    `gather_neighbours`. Differentiable in `projected` and `output`; the backward pass is deterministic.
+    With the features z and offsets q of `gather_neighbours` and t = z + Wq + b, the result equals
+    t + linear(attend_neighbours(linear(layer_norm(t), M), heads), O). It is differentiable in `projected` and `output`,
+    and the backward pass is deterministic.
 
     Args:
-        projected: `project_pixels` of the features, float32 or float64.
-        queries: (B, Q, 2) pixel coordinates (row, column).
-        output: Weight O (C, C) and bias (C,) of the projection of what was attended to.
+        projected: The features after `project_pixels`, float32 or float64.
+        queries: (B, Q, 2) pixel coordinates (row, column). Those beyond ±2^30 count as ±2^30.
+        output: Weight O (C, C) and bias (C,) of the projection of the attended values.
         wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
-        eps: Of the layer norm.
+        eps: ε of the layer norm.
         backend: "warp", or "torch" for the plain twin in `kernels.reference`.
 
     Returns:
-        (B, Q, 4, C) tokens, in the usual order of neighbours; of the dtype of `projected`, or under autocast of
-        autocast's, but computed in that of `projected`.
+        (B, Q, 4, C) tokens, in the usual order of neighbours. They are computed in the dtype of `projected`, which is
+        also theirs; under autocast they are rounded to autocast's.
 
     Raises:
         TypeError: If `projected` or `queries` is not of a supported floating-point dtype.
         ValueError: If a shape, device or backend does not fit.
 
-    Source: paper Sec. II-B, "Feature transformation using self-attention"; the hoisting is ours.
+    Source: paper Sec. II-B, "Feature transformation using self-attention"; projecting pixels instead of tokens is ours.
     """
     check_backend(backend)
     pixels, slope, shift, gram, heads = projected
     check_floating("projected.pixels", pixels, [torch.float32, torch.float64], "(B, H, W, 4·C + 16)")
     check_queries(queries)
-    tensors = {"projected": pixels, "slope": slope, "shift": shift, "gram": gram, "queries": queries}
-    check_devices(**tensors, output=output[0], bias=output[1])
+    outputs = {f"output[{i}]": tensor for i, tensor in enumerate(output)}
+    check_devices(**projected.named(), queries=queries, **outputs)
     if queries.ndim != 3 or len(queries) != len(pixels):
         raise ValueError(f"queries has shape {tuple(queries.shape)}; it should be ({len(pixels)}, Q, 2)")
     channels = len(shift) // 3
@@ -184,7 +186,7 @@ def neighbour_attention(
     device = pixels.device.type
     dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else pixels.dtype
     queries = queries.detach().to(pixels.dtype)
-    weight = output[0].to(pixels.dtype)[:, head_last(channels, heads, pixels.device)]
+    weight = head_last(output[0].to(pixels.dtype), heads)
     bias = output[1].to(pixels.dtype)
     pixels, queries = pixels.contiguous(), queries.contiguous()
     if backend == "torch":

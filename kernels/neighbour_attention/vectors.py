@@ -1,9 +1,11 @@
-"""neighbour_attention on CPU cores: each query from the table of pixels to its tokens without leaving the cache.
+"""Kernels of neighbour_attention whose threads take all heads of a query: for CPUs, float32 and the paper's 8 heads.
 
-The output projection is done 4 tokens at a time, in registers, by the thread that attended. In the backward pass a
-thread has a row of cells to itself (`kernels.scatter.cell`), whose queries it takes in order: what they say of the
-two rows of pixels around them it adds up in place, so that the result does not depend on the number of cores, and
-nothing that is as large as the tokens need be kept from the forward pass.
+A thread takes one query after the other from the table of pixels to its tokens, which stay in the cache of its core. It
+does the output projection as well, 4 tokens at a time in registers.
+
+In the backward pass a thread takes the queries of one band: a row of cells (`kernels.scatter`) between two rows of
+pixels. It computes their attention again and adds their gradients to those two rows in place. The queries are sorted,
+so that the result does not depend on the number of cores. Nothing as large as the tokens is kept from the forward pass.
 """
 
 from typing import Any
@@ -19,10 +21,10 @@ from kernels.scatter import sort_queries
 
 __all__ = ["HEADS", "fits", "step", "step_backward"]
 
-# Threads that share the queries of a forward pass. Each has a few rows of memory to itself.
+# Threads among which the queries of a forward pass are split. Each has a few rows of memory of its own.
 _WORKERS = 64
 
-# Two channels of each fill the lanes.
+# Number of heads: two channels of each fill a vector.
 HEADS = LANES // 2
 
 _lanes = vectors(LANES, wp.float32)
@@ -36,7 +38,7 @@ class _Scratch:
     tokens: wp.array2d[_lanes]
     """(4·threads, blocks): t."""
     attended: wp.array2d[_lanes]
-    """(4·threads, blocks): what the heads attended to."""
+    """(4·threads, blocks): the attended values."""
     attended_scalars: wp.array2d[float]
     """(4·threads, C): the same memory, number by number."""
 
@@ -46,20 +48,20 @@ class _BackwardScratch:
     """Memory of the threads of the backward pass: rows 4 i to 4 i + 3 belong to thread i."""
 
     adj_tokens: wp.array2d[_lanes]
-    """(4·threads, blocks): gradient of t, which is that of the step."""
+    """(4·threads, blocks): gradient of t, which is that of the result."""
     adj_tokens_scalars: wp.array2d[float]
     """(4·threads, C): the same memory, number by number."""
     adj_attended: wp.array2d[_lanes]
-    """(4·threads, blocks): gradient of what the heads attended to."""
+    """(4·threads, blocks): gradient of the attended values."""
     attended: wp.array2d[_lanes]
-    """(4·threads, blocks): what the heads attended to."""
+    """(4·threads, blocks): the attended values."""
     adj_rows: wp.array2d[_lanes]
     """(4·threads, 4·blocks): gradients of A + B q and of z + Wq + b."""
 
 
 @wp.struct
 class _Gradients:
-    """What the backward pass adds up: of the pixels in place, of the parameters for each thread."""
+    """Sums of gradients: of the pixels in place, of the parameters in a row for each thread."""
 
     pixels: wp.array2d[_lanes]
     """(B·H·W, 4·blocks and padding): of `PixelTable.pixels`."""
@@ -167,7 +169,7 @@ _step, _step_backward = (
 
 
 def fits(pixels: torch.Tensor, dtype: torch.dtype, channels: int, heads: int) -> bool:
-    """Whether these kernels serve: on a CPU, the paper's 8 heads, whole blocks of 4×16 channels."""
+    """Whether these kernels serve: float32 on a CPU, 8 heads, C a multiple of 64, and a result in `dtype`."""
     return (
         heads == HEADS
         and channels % (4 * LANES) == 0
@@ -190,7 +192,7 @@ def step(
     wrap: bool,
     dtype: torch.dtype,
 ) -> torch.Tensor:
-    """(B, Q, 4, C) tokens after the step; the arguments are those of the op `neighbour_attention`."""
+    """Returns the (B, Q, 4, C) tokens after the step; its arguments are those of the op."""
     batch, count, channels = len(pixels), queries.shape[1], len(bias)
     step = pixels.new_empty(batch, count, 4, channels, dtype=dtype)
     tokens, attended = pixels.new_empty(2, 4 * _WORKERS, channels)
@@ -214,7 +216,7 @@ def step_backward(
     eps: float,
     wrap: bool,
 ) -> tuple[torch.Tensor, ...]:
-    """Gradients of pixels, slope, shift, gram, weight and bias; the arguments are those of the op's backward."""
+    """Returns the gradients of pixels, slope, shift, gram, weight and bias; its arguments are the backward op's."""
     batch, height, width, columns = pixels.shape
     count, channels = queries.shape[1], len(weight)
     order, starts = sort_queries(queries, height, width, wrap)
@@ -245,7 +247,7 @@ def step_backward(
         "weight": adj_weight.view(-1, channels),
         "bias": adj_bias,
     }
-    for parity in range(2):  # bands next to each other share a row of pixels
+    for parity in range(2):  # even bands, then odd ones: two neighbouring bands add to the same row of pixels
         threads = (bands + 1 - parity) // 2
         launch(_step_backward[adj_step.dtype], threads, [*inputs, parity], [rows, gradients], least=1)
     affine, (down, both, right) = adj_affine.sum(0), adj_gram.sum(0)

@@ -1,3 +1,5 @@
+import re
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -111,7 +113,7 @@ def test_opcheck_without_gradients():
 
 def test_what_it_does_not_serve_is_named():
     projected, image, queries, weights = draw()
-    with pytest.raises(ValueError, match="projected has no kernel"):
+    with pytest.raises(ValueError, match=r"projected is torch\.float32 on cpu with 4 heads and 64 channels"):
         fused_decode(projected._replace(heads=4), image, queries, weights)
     with pytest.raises(ValueError, match=r"image has shape \(2, 4, 16\)"):
         fused_decode(projected, image[:, :4], queries, weights)
@@ -119,3 +121,33 @@ def test_what_it_does_not_serve_is_named():
         fused_decode(projected, image, queries, weights, "cubic")
     with pytest.raises(ValueError, match=r"queries has shape \(500, 2\)"):
         fused_decode(projected, image, queries[0], weights)
+
+
+def test_a_tensor_on_another_device_is_named():
+    projected, image, queries, weights = draw(count=9)
+    added = torch.zeros(2, 9, 4)
+
+    def refused(name, projected=projected, image=image, queries=queries, weights=weights, added=added):
+        with pytest.raises(ValueError, match=rf"{re.escape(name)} is on meta; it should be on cpu, where projected"):
+            fused_decode(projected, image, queries, weights, added=added)
+
+    for name in ("slope", "shift", "gram"):
+        refused(f"projected.{name}", projected=projected._replace(**{name: getattr(projected, name).to("meta")}))
+    refused("image", image=image.to("meta"))
+    refused("queries", queries=queries.to("meta"))
+    refused("added", added=added.to("meta"))
+    for name in weights._fields:
+        for i in range(2):
+            pair = [tensor.to("meta") if j == i else tensor for j, tensor in enumerate(getattr(weights, name))]
+            refused(f"weights.{name}[{i}]", weights=weights._replace(**{name: tuple(pair)}))
+
+
+@pytest.mark.parametrize("absurd", [1e9, 1e30, float("inf")])
+def test_absurd_queries_give_finite_ranges_equal_to_the_twins(absurd, poisoned):
+    projected, image, queries, weights = draw()
+    queries[:, ::5] = absurd
+    queries[:, 1::5, 0] = -absurd
+    queries[:, 2::5, 1] = absurd
+    ours, plain = (fused_decode(projected, image, queries, weights, backend=b) for b in ("warp", "torch"))
+    assert ours.isfinite().all()
+    torch.testing.assert_close(ours, plain, rtol=0, atol=METRES)

@@ -1,6 +1,9 @@
+import re
+
 import pytest
 import torch
 import torch.nn.functional as F
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from kernels import attend_neighbours, gather_neighbours, neighbour_attention, project_pixels
 from kernels.neighbour_attention.op import _neighbour_attention
@@ -139,3 +142,82 @@ def test_bad_arguments_are_named(device):
         neighbour_attention(projected, queries[:1], output)
     with pytest.raises(ValueError, match=r"output has shapes \[\(12, 12\), \(12, 12\)\]"):
         neighbour_attention(projected, queries, (output[0], output[0]))
+
+
+def test_a_tensor_on_another_device_is_named():
+    features, queries, position, norm, qkv_weight, output, heads = draw_step("cpu")
+    projecting = {"position[0]": position[0], "position[1]": position[1], "norm[0]": norm[0], "norm[1]": norm[1]}
+    projecting |= {"qkv_weight": qkv_weight}
+    for name, tensor in projecting.items():
+        p, n, m = ([x.to("meta") if x is tensor else x for x in group] for group in (position, norm, [qkv_weight]))
+        with pytest.raises(ValueError, match=rf"{re.escape(name)} is on meta; it should be on cpu, where features is"):
+            project_pixels(features, p, n, m[0], heads)
+    projected = project_pixels(features, position, norm, qkv_weight, heads)
+    for name in ("slope", "shift", "gram"):
+        moved = projected._replace(**{name: getattr(projected, name).to("meta")})
+        with pytest.raises(ValueError, match=rf"projected.{name} is on meta; it should be on cpu"):
+            neighbour_attention(moved, queries, output)
+    with pytest.raises(ValueError, match=r"projected.slope is on cpu; it should be on meta"):
+        neighbour_attention(projected._replace(pixels=projected.pixels.to("meta")), queries, output)
+    with pytest.raises(ValueError, match="queries is on meta; it should be on cpu"):
+        neighbour_attention(projected, queries.to("meta"), output)
+    for i in range(2):
+        moved = [tensor.to("meta") if j == i else tensor for j, tensor in enumerate(output)]
+        with pytest.raises(ValueError, match=rf"output\[{i}\] is on meta; it should be on cpu"):
+            neighbour_attention(projected, queries, moved)
+
+
+@pytest.mark.parametrize(("channels", "heads"), [(12, 3), (64, 8)])
+@pytest.mark.parametrize("autocast", [False, True])
+def test_fake_tensors_have_the_shapes_dtypes_and_devices_of_real_ones(channels, heads, autocast, device):
+    step = draw_step(device, torch.float32, channels, heads, count=9)
+
+    def run(*step):
+        with torch.autocast(device.type, torch.bfloat16, enabled=autocast):
+            return with_gradients(hoisted, *step)
+
+    real = run(*step)
+    mode = FakeTensorMode()
+    with mode:
+        convert = mode.from_tensor
+        features, queries, position, norm, qkv_weight, output, _ = step
+        pairs = [[convert(t) for t in pair] for pair in (position, norm, output)]
+        fake = run(convert(features), convert(queries), *pairs[:2], convert(qkv_weight), pairs[2], heads)
+    for ours, expected in zip(fake, real, strict=True):
+        assert (ours.shape, ours.dtype, ours.device) == (expected.shape, expected.dtype, expected.device)
+
+
+@pytest.mark.parametrize(("channels", "heads"), [(12, 3), (64, 8)])
+@pytest.mark.parametrize("features", ["drawn", "constant"])
+@pytest.mark.parametrize("absurd", [1e9, 1e19, 1e30, float("inf")])
+def test_absurd_queries_give_finite_results_and_gradients_equal_to_the_twins(
+    channels, heads, features, absurd, device, poisoned
+):
+    z, queries, *rest = draw_step(device, torch.float32, channels, heads)
+    if features == "constant":
+        z = z[:, :1, :1, :1].expand_as(z)
+    queries[:, ::5] = absurd
+    queries[:, 1::5, 0] = -absurd
+    queries[:, 2::5, 1] = absurd
+    ours, plain = (with_gradients(hoisted, z, queries, *rest, backend=backend) for backend in ("warp", "torch"))
+    assert all(tensor.isfinite().all() for tensor in ours)
+    assert_same(ours, plain, 1e-4)
+
+
+@pytest.mark.parametrize(("channels", "heads"), [(12, 3), (64, 8)])
+def test_a_variance_that_rounds_below_0_counts_as_0(channels, heads, device, poisoned):
+    z, queries, position, norm, qkv_weight, output, _ = draw_step(device, torch.float32, channels, heads)
+    projected = project_pixels(z, position, norm, qkv_weight, heads)
+    projected.pixels[..., 4 * channels] -= 1e6  # xᵀx, far below what it can be
+    results = []
+    for backend in ("warp", "torch"):
+        leaves = [tensor.clone().requires_grad_() for tensor in (*projected[:4], *output)]
+        tokens = neighbour_attention(type(projected)(*leaves[:4], heads), queries, leaves[4:], backend=backend)
+        results.append([tokens.detach(), *torch.autograd.grad(tokens.square().sum(), leaves)])
+    ours, plain = results
+    assert all(tensor.isfinite().all() for tensor in ours)
+    below = 4 * channels
+    assert not ours[1][..., below : below + 3].any()  # where 0 stands for it, xᵀx and u have no gradient
+    assert not ours[4].any()
+    for a, b in zip(ours, plain, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-4 * b.abs().max().item())
