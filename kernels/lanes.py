@@ -1,9 +1,9 @@
-"""Lanes: the same scalar function on every component of a vector.
+"""Lanes: the components of a vector, to each of which the same scalar function is applied.
 
 A CPU is fast when it loads, computes and stores whole vectors. Warp's CPU compiler makes SIMD instructions of functions
-of `wp.types.vector`s, provided that their components are not addressed by run-time indices; loops around them had
-better stay loops, since unrolled ones take long to compile and confuse it. A GPU wants one lane per thread: a
-vector of length 1.
+of `wp.types.vector`s if no component is addressed by a run-time index. Loops over such functions should stay loops:
+unrolled ones take long to compile and become fewer SIMD instructions. On a GPU each thread is a lane already, so that a
+vector has length 1.
 """
 
 from typing import Any
@@ -33,7 +33,7 @@ _one_double = wp.types.vector(1, wp.float64)
 
 
 def vectors(lanes: int, scalar: type) -> type:
-    """The vector type of so many lanes: `LANES` float32, or 1 of float32 or float64."""
+    """Returns the type of a vector of lanes: `LANES` of float32, or 1 of float32 or float64."""
     return {(LANES, wp.float32): _wide, (1, wp.float32): _one, (1, wp.float64): _one_double}[lanes, scalar]
 
 
