@@ -187,7 +187,7 @@ def neighbour_attention(
     dtype = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else pixels.dtype
     queries = queries.detach().to(pixels.dtype)
     weight = head_last(output[0].to(pixels.dtype), heads)
-    bias = output[1].to(pixels.dtype)
+    bias = output[1].to(pixels.dtype).contiguous()
     pixels, queries = pixels.contiguous(), queries.contiguous()
     if backend == "torch":
         step = reference.neighbour_attention(pixels, queries, slope, shift, gram, weight, bias, heads, eps, wrap)

@@ -47,7 +47,7 @@ class Projected(NamedTuple):
 
 def head_last(tensor: torch.Tensor, heads: int) -> torch.Tensor:
     """Returns (..., C) channels that were stored [head][d] in the order [d][head]."""
-    return tensor.unflatten(-1, (heads, -1)).transpose(-1, -2).flatten(-2)
+    return tensor.unflatten(-1, (heads, -1)).transpose(-1, -2).flatten(-2).contiguous()
 
 
 def project_pixels(
