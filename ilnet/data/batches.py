@@ -14,8 +14,8 @@ import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
 from ilnet.data.archive import Archive
+from ilnet.data.random_sensors import draw_effects, draw_sensor
 from ilnet.data.rimg import RangeImageTree
-from ilnet.data.sensors import draw_effects, draw_sensor
 from ilnet.sensor import Sensor, angles_to_directions
 from ilnet.world import simulate
 from ilnet.world.effects import nearer, spoil

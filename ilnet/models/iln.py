@@ -77,6 +77,8 @@ class Block(nn.Module):
 class ILN(Model):
     """r̂ = Σ_t w_t r_t with weights w = softmax(g(z'_1..4)) that a network predicts (paper, Eq. 3).
 
+    The network is here; `kernels.gather_blend` is the softmax and the sum.
+
     Args:
         depth: Number of attention blocks D.
         prior: The interpolation that untrained weights start from: "none" (the paper); "bilinear" or "perspective", see

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from ilnet import data
-from ilnet.data.sensors import draw_effects, draw_sensor
+from ilnet.data.random_sensors import draw_effects, draw_sensor
 from ilnet.sensor import PAPER_INPUT
 from ilnet.world.effects import Effects
 
