@@ -268,7 +268,7 @@ def surface_hypotheses(
     u = u[..., None, None]
     found = u + changes[0].unsqueeze(-1) + changes[1].unsqueeze(-2)
     found = torch.minimum(torch.maximum(found, u / CONTINUED), u * CONTINUED)
-    return (1 / found.clamp(min=1e-9)).where(u > 0, 0.0).flatten(-2)
+    return (1 / found).where(u > 0, 0.0).flatten(-2)
 
 
 def _log_weights(queries: torch.Tensor, scores: torch.Tensor) -> torch.Tensor:
@@ -315,11 +315,12 @@ def surface_median(
     r, order = found.where(found > 0, math.inf).flatten(-2).sort(-1)
     below = w.flatten(-2).gather(-1, order).cumsum(-1)
     median = r.gather(-1, (below < 0.5).sum(-1, keepdim=True).clamp(max=r.shape[-1] - 1)).unsqueeze(-1)
-    none = w.where(found == 0, 0.0).flatten(-2).sum(-1)
+    whole, none = w.flatten(-2).sum(-1), (w * (found == 0)).flatten(-2).sum(-1)
     b = (0.5 * F.softplus(scales) + LEAST_SCALE).unsqueeze(-1)
     ends = [(median - found + side).where(median.isfinite(), 0.0) / b for side in (-TOLERANCE, TOLERANCE)]
     low, high = (torch.where(x < 0, 0.5 * x.clamp(max=0).exp(), 1 - 0.5 * (-x).clamp(max=0).exp()) for x in ends)
     near = (w * (high - low)).where(found > 0, 0.0).flatten(-2).sum(-1)
     median = median.flatten(-3)
     confidence = near.where(median.isfinite(), none)
-    return median.where(median.isfinite(), 0.0), (1 - 2 * BACKGROUND) * confidence, (1 - 2 * BACKGROUND) * none
+    ranges = median.where(median.isfinite(), 0.0).where(~whole.isnan(), math.nan)
+    return ranges, (1 - 2 * BACKGROUND) * confidence, (1 - 2 * BACKGROUND) * none

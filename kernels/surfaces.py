@@ -1,34 +1,40 @@
-"""surfaces: where the surfaces of the 4 neighbours of a query are met along it, and how likely each of these is.
+"""surfaces: ranges at which the surfaces of the 4 neighbours of a query may be met, and how likely each of them is.
 
-The inverse range u = 1/r of a plane is A cos α + B sin α along a row or a column of the range image, α being the angle
-from pixel to pixel. Two pixels t and o therefore tell the whole of it, at any angle α of a query:
+Take two pixels t and o of one column of the range image, and let α be the elevation. Along the column the inverse range
+u = 1/r of a plane is A cos α + B sin α. Two pixels therefore tell it at the elevation α of any query:
 
     u(α) = (u_t sin(α_o - α) + u_o sin(α - α_t)) / sin(α_o - α_t)                                                    (1)
 
-Each neighbour t lies on a surface that can be continued to the query in three ways along its column and in three ways
-along its row: with the *outer* pixel, the one beyond t as seen from the query; with the *inner* one, across the query;
-or not at all, since t may be all there is of its surface. Changes along the column and along the row add up. That makes
-9 hypotheses a neighbour and K = 36 a query:
+Along a row α is the azimuth, and u is A cos α + B sin α + C. There Eq. (1) leaves an error of at most about δ² C, from
+one gap δ before the two pixels to one behind them.
+
+Each neighbour t lies on a surface that may go on to the query. Along the column there are three ways to continue it:
+with the *outer* pixel, the one beyond t as seen from the query; with the *inner* pixel, the one on the query's side; or
+not at all, since t may be all there is of its surface. Along the row there are the same three. The change along the
+column and the change along the row are added. That makes 9 hypotheses for a neighbour and 36 for a query:
 
     u_tk = u_t + (u_v(α_v) - u_t) + (u_h(α_h) - u_t),    r_tk = 1 / u_tk,    u_t / 4 <= u_tk <= 4 u_t                (2)
 
-A pixel without a return cannot be continued, nor can another be continued with it, nor over a gap of more than 0.5 rad:
-then u(α) = u_t. All hypotheses of a neighbour without a return are that there is none.
+Where one of the two pixels has no return, or the gap between them is wider than 0.5 rad, nothing is continued and
+u(α) = u_t. All hypotheses of a neighbour without a return say that nothing returns.
 
-A network gives each hypothesis a score s_tk and each neighbour a scale c_t; with the bilinear areas a_t as a prior
+A network gives each hypothesis a score s_tk and each neighbour a scale c_t. The bilinear areas a_t are the prior:
 
     w_tk = softmax(s_tk + log max(a_t, 0.001)),    b_t = 0.5 log(1 + exp c_t) + 0.02 m                               (3)
 
-The range r of a query then is a mixture of Laplace distributions, and of the chance that nothing returns:
+The range r of a query then has the following density, a mixture of Laplace distributions, and nothing returns with the
+following probability:
 
-    p(r) = (1 - 2 ε) Σ_tk w_tk exp(-|r_tk - r| / b_t) / 2 b_t + ε / R      over the hypotheses that return,          (4)
+    p(r) = (1 - 2 ε) Σ_tk w_tk exp(-|r_tk - r| / b_t) / 2 b_t + ε / R      over the hypotheses that return           (4)
     p(none) = (1 - 2 ε) Σ_tk w_tk + ε                                      over those that do not
 
-with ε = 0.001 for what no neighbour tells, and R for the range that a no return counts as. The answer is the weighted
-median of the r_tk, a no return being farthest. It has the least expected absolute error, and it *is* one of the
-hypotheses, so that nothing floats between two surfaces.
+ε = 0.001 is for what no neighbour tells. R is the range that a no return counts as.
+
+The answer is the weighted median of the r_tk, where a no return is farther than any range. Of all answers the median
+has the least expected absolute error. It is one of the hypotheses, so that no point floats between two surfaces.
 """
 
+import math
 from typing import Any
 
 import torch
@@ -97,8 +103,18 @@ def _continue(gap: Any, angle: Any):
 
 
 @wp.func
+def _within(x: Any, low: Any, high: Any):
+    """The value x, clamped to lie between low and high; NaN for NaN, which `wp.clamp` may drop."""
+    return wp.where(x < low, low, wp.where(x > high, high, x))
+
+
+@wp.func
 def _along(coordinate: Any, side: int, table: wp.array[Any], wrap: int):
-    """Along one axis, for the neighbours on one side of a query: pixel, outer and inner pixel, and their factors."""
+    """Along one axis, for the neighbours on one side of a query: pixel, outer and inner pixel, and their factors.
+
+    `side` is 0 for the neighbours below the coordinate and 1 for those above. The factors are two for the outer pixel
+    and two for the inner one, see `_continue`.
+    """
     count = table.shape[0]
     unbounded = base(coordinate) + side
     if wrap == 0:
@@ -110,10 +126,10 @@ def _along(coordinate: Any, side: int, table: wp.array[Any], wrap: int):
     outer = column_of(unbounded - towards, count, wrap)
     inner_gap = _gap(table, t, inner, wrap)
     outer_gap = _gap(table, t, outer, wrap)
-    # Beyond the table its last spacing goes on, as in `Sensor.locate`.
+    # Beyond the table its last spacing goes on.
     spacing = wp.where(inner == t, -outer_gap, inner_gap)
     limit = type(coordinate)(_WIDEST_GAP)
-    angle = wp.clamp(wp.abs(offset) * spacing, -limit, limit)
+    angle = _within(wp.abs(offset) * spacing, -limit, limit)
     a_outer, b_outer = _continue(outer_gap, angle)
     a_inner, b_inner = _continue(inner_gap, angle)
     return t, outer, inner, a_outer, b_outer, a_inner, b_inner
@@ -121,7 +137,7 @@ def _along(coordinate: Any, side: int, table: wp.array[Any], wrap: int):
 
 @wp.func
 def _inverse(image: wp.array3d[Any], b: int, i: int, j: int):
-    """U of a pixel; 0 where nothing returned."""
+    """The inverse range u of a pixel; 0 where nothing returned."""
     r = image[b, i, j]
     one = type(r)(1.0)
     return wp.where(r > type(r)(0.0), one / wp.max(r, type(r)(_LEAST_RANGE)), type(r)(0.0))
@@ -154,15 +170,14 @@ def _hypotheses(rays: Any, b: int, row: Any, column: Any, zeros: Any):
         h[0] = _change(u, _inverse(rays.image, b, i, j_outer), c_outer, d_outer)
         h[1] = _change(u, _inverse(rays.image, b, i, j_inner), c_inner, d_inner)
         for k in range(9):
-            x = wp.clamp(u + v[k // 3] + h[k % 3], u / within, u * within)
-            found[9 * t + k] = wp.where(u > zero, type(row)(1.0) / wp.max(x, type(row)(1.0e-9)), zero)
+            x = _within(u + v[k // 3] + h[k % 3], u / within, u * within)
+            found[9 * t + k] = wp.where(u > zero, type(row)(1.0) / x, zero)
     return found
 
 
 @wp.func
 def _weigh(scores: Any, row: Any, column: Any):
     """The weights of Eq. (3), up to a common factor."""
-    one = type(row)(1.0)
     largest = scores[0]
     for k in range(len(scores)):
         largest = wp.max(largest, scores[k])
@@ -171,7 +186,8 @@ def _weigh(scores: Any, row: Any, column: Any):
         w[k] = (scores[k] - largest) * type(row)(1.4426950408889634)
     w = exp2(w)
     for t in range(4):
-        a = wp.max(area(row, column, t), one * type(row)(_AREA_FLOOR))
+        a = area(row, column, t)
+        a = wp.where(a < type(row)(_AREA_FLOOR), type(row)(_AREA_FLOOR), a)  # not `max`, which may drop NaN
         for k in range(9):
             w[9 * t + k] = w[9 * t + k] * a
     return w
@@ -214,8 +230,11 @@ def _mass(x: Any):
 
 
 @wp.func
-def settle(found: Any, w: Any, scales: Any):
-    """The weighted median of hypotheses, 0 for no return, how much to trust it, and the chance of no return."""
+def _settle(found: Any, w: Any, scales: Any):
+    """The weighted median of hypotheses, the probability that it is right, and that of no return.
+
+    The median is 0 for no return and NaN where a weight is NaN.
+    """
     zero = type(scales[0])(0.0)
     infinite = type(scales[0])(wp.inf)
     r = found
@@ -245,7 +264,7 @@ def settle(found: Any, w: Any, scales: Any):
                     near = near - _mass((median - x - type(zero)(_TOLERANCE)) * inverse)
                     trusted = trusted + w[9 * t + k] * near
     else:
-        median = zero
+        median = wp.where(whole >= zero, zero, whole)  # NaN for NaN
     known = (type(zero)(1.0) - type(zero)(2.0) * type(zero)(_BACKGROUND)) / whole
     return median, trusted * known, none * known
 
@@ -381,7 +400,7 @@ def _kernels(scalar: type) -> tuple[wp.Kernel, ...]:
         column = rays.queries[b, q, 1]
         w = _weigh(scores[b, q], row, column)
         found = _hypotheses(rays, b, row, column, scores.dtype())
-        median, confidence, none = settle(found, w, scales[b, q])
+        median, confidence, none = _settle(found, w, scales[b, q])
         ranges_out[b, q] = median
         confidence_out[b, q] = confidence
         none_out[b, q] = none
@@ -537,9 +556,9 @@ def surface_hypotheses(
     wrap: bool = True,
     backend: str = "warp",
 ) -> torch.Tensor:
-    """Finds where the surfaces of the 4 neighbours of each query, continued in 9 ways each, are met along it.
+    """Finds the ranges at which each query meets the surfaces of its 4 neighbours, continued in 9 ways each.
 
-    It carries no gradient: ranges are measured.
+    The hypotheses follow from measured ranges and carry no gradient.
 
     Args:
         image: (..., H, W) float32 or float64 ranges in metres, 0 where nothing returned.
@@ -550,9 +569,9 @@ def surface_hypotheses(
         backend: "warp", or "torch" for the plain twin in `kernels.reference`.
 
     Returns:
-        (..., Q, 4, 9) metres, 0 for no return; neighbours in the order (row-, col-), (row-, col+), (row+, col-),
-        (row+, col+), for each of them 3 v + h, continued along the column as v says and along the row as h says:
-        0, with the outer pixel; 1, with the inner one; 2, not at all.
+        (..., Q, 4, 9) metres, 0 for no return and NaN where the query is NaN. Neighbours are in the order (row-, col-),
+        (row-, col+), (row+, col-), (row+, col+). Hypothesis 3 v + h of a neighbour is continued along the column as v
+        says and along the row as h says: 0 with the outer pixel, 1 with the inner one, 2 not at all.
 
     Raises:
         TypeError: If an argument is not a floating-point tensor of a supported dtype.
@@ -586,10 +605,11 @@ def surface_likelihood(
         queries: (..., Q, 2) pixel coordinates (row, column). Leading dimensions broadcast against those of `image`.
         elevations: (H,) radians, of the rows; any spacing.
         azimuths: (W,) radians, of the columns; any spacing.
-        scores: (..., Q, 4, 9), s_tk of the hypotheses of `surface_hypotheses`.
+        scores: (..., Q, 4, 9), s_tk of the hypotheses of `surface_hypotheses`, with all leading dimensions, float32,
+            float64, bfloat16 or float16. They are computed with in the dtype of `image`, as are the next two.
         scales: (..., Q, 4), c_t of the neighbours.
         targets: (..., Q) measured ranges in metres, 0 where nothing returned.
-        far: R, the metres that a no return counts as.
+        far: R, the range in metres that a no return counts as.
         wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
         backend: "warp", or "torch" for the plain twin in `kernels.reference`.
 
@@ -603,13 +623,13 @@ def surface_likelihood(
 
     Source: ours, Eqs. (3) and (4) of `kernels.surfaces`.
     """
-    if not far > 0:
-        raise ValueError(f"far is {far}; it should be a number of metres above 0")
+    if not 0 < far < math.inf:
+        raise ValueError(f"far is {far}; it should be a finite number of metres above 0")
     batch, image, queries, tables = _checked(image, queries, elevations, azimuths, backend)
     count = queries.shape[1]
     scores = _of_queries("scores", scores, batch, (count, 4, KINDS), image)
     scales = _of_queries("scales", scales, batch, (count, 4), image)
-    targets = _of_queries("targets", targets.detach(), batch, (count,), image)
+    targets = _of_queries("targets", targets, batch, (count,), image).detach()
     op = reference.surface_likelihood if backend == "torch" else _surface_likelihood
     likelihood, error = op(image, queries, *tables, wrap, scores, scales, targets, float(far))
     return likelihood.view(*batch, count), error.view(*batch, count)
@@ -625,33 +645,37 @@ def surface_median(
     wrap: bool = True,
     backend: str = "warp",
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Answers queries with the weighted median of their hypotheses. For inference: no gradients.
+    """Answers queries with the weighted median of their hypotheses.
+
+    It is for inference and gives no gradients.
 
     Args:
         image: (..., H, W) float32 or float64 ranges in metres, 0 where nothing returned.
         queries: (..., Q, 2) pixel coordinates (row, column). Leading dimensions broadcast against those of `image`.
         elevations: (H,) radians, of the rows; any spacing.
         azimuths: (W,) radians, of the columns; any spacing.
-        scores: (..., Q, 4, 9), s_tk of the hypotheses of `surface_hypotheses`.
+        scores: (..., Q, 4, 9), s_tk of the hypotheses of `surface_hypotheses`, with all leading dimensions, float32,
+            float64, bfloat16 or float16. They are computed with in the dtype of `image`, as are the scales.
         scales: (..., Q, 4), c_t of the neighbours.
         wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
         backend: "warp", or "torch" for the plain twin in `kernels.reference`.
 
     Returns:
-        ranges: (..., Q) metres, 0 for no return.
-        confidence: (..., Q), the probability that the answer is right: to 10 cm, or in that nothing returns.
-        no_return: (..., Q), the probability that nothing returns.
+        ranges: (..., Q) metres, 0 for no return, and NaN where a score or the query is NaN.
+        confidence: (..., Q), the probability that the range is right to 10 cm, or that nothing returns where the answer
+            says so.
+        no_return: (..., Q), the probability that nothing returns. Like the confidence it leaves out the ε of Eq. (4).
 
     Raises:
         TypeError: If an argument is not a floating-point tensor of a supported dtype.
         ValueError: If a shape, device or backend does not fit.
 
-    Source: ours, see `kernels.surfaces`.
+    Source: ours, Eqs. (3) and (4) of `kernels.surfaces`.
     """
     batch, image, queries, tables = _checked(image, queries, elevations, azimuths, backend)
     count = queries.shape[1]
-    scores = _of_queries("scores", scores.detach(), batch, (count, 4, KINDS), image)
-    scales = _of_queries("scales", scales.detach(), batch, (count, 4), image)
+    scores = _of_queries("scores", scores, batch, (count, 4, KINDS), image).detach()
+    scales = _of_queries("scales", scales, batch, (count, 4), image).detach()
     op = reference.surface_median if backend == "torch" else _surface_median
     ranges, confidence, none = op(image, queries, *tables, wrap, scores, scales)
     return ranges.view(*batch, count), confidence.view(*batch, count), none.view(*batch, count)
@@ -685,7 +709,8 @@ def _of_queries(
     name: str, tensor: torch.Tensor, batch: torch.Size, shape: tuple[int, ...], image: torch.Tensor
 ) -> torch.Tensor:
     """Checks what each query has one of, and folds its leading dimensions into one."""
-    check_floating(name, tensor, [torch.float32, torch.float64, torch.bfloat16, torch.float16], "of the queries")
+    dtypes = [torch.float32, torch.float64, torch.bfloat16, torch.float16]
+    check_floating(name, tensor, dtypes, str((*batch, *shape)))
     if tensor.shape != (*batch, *shape):
         raise ValueError(f"{name} has shape {tuple(tensor.shape)}; it should be {(*batch, *shape)}")
     check_devices(image=image, **{name: tensor})
