@@ -73,6 +73,7 @@ def whole_decoder(features, queries, qkv_weight, image, scores):
     return fused_decode(project(8, features, qkv_weight), image, queries, weights, "bilinear", added=scores)
 
 
+RAYS = ("image", "queries", "elevations", "azimuths")
 CASES = {
     "gather_neighbours": Case(
         lambda features, queries: gather_neighbours(features, queries)[0],
@@ -124,18 +125,21 @@ CASES = {
         saved=("queries",),
         vmap=False,
     ),
+    "surface_likelihood": Case(
+        lambda *tensors: sum(surface_likelihood(*tensors, 100.0)),
+        (*RAYS, "hypothesis_scores", "scores", "targets"),
+        leaves=("hypothesis_scores", "scores"),
+        half="hypothesis_scores",
+        half_out=torch.float32,
+        saved=(*RAYS, "hypothesis_scores", "scores", "targets"),
+        vmap=False,
+    ),
 }
 
-RAYS = ("image", "queries", "elevations", "azimuths")
 OTHERS = {
     "plane_prior": Case(plane_prior, ("image", "queries")),
     "fused_decode": Case(whole_decoder, ("features", "queries", "qkv_weight", "image", "scores")),
     "surface_hypotheses": Case(surface_hypotheses, RAYS),
-    "surface_likelihood": Case(
-        lambda *tensors: surface_likelihood(*tensors, 100.0)[0],
-        (*RAYS, "hypothesis_scores", "scores", "targets"),
-        leaves=("hypothesis_scores", "scores"),
-    ),
     "surface_median": Case(lambda *tensors: surface_median(*tensors)[0], (*RAYS, "hypothesis_scores", "scores")),
 }
 EVERY = CASES | OTHERS
@@ -219,7 +223,9 @@ def test_autocast_changes_nothing_and_half_precision_gives_the_documented_dtype(
 def test_vmap_maps_over_a_batch_with_gradients_or_says_what_to_do(case, device):
     tensors = draw(case, device)
     if not case.vmap:
-        with pytest.raises(NotImplementedError, match=r"does not go through .*vmap; its features and queries have"):
+        with pytest.raises(
+            NotImplementedError, match=r"does not go through .*vmap; its (features|image) and queries have"
+        ):
             torch.vmap(lambda queries: case.call(*(tensors | {"queries": queries}).values()))(tensors["queries"][None])
         return
     assert_same(run(case, tensors, torch.vmap(case.call)), run(case, tensors))
@@ -277,7 +283,7 @@ def test_gradients_are_the_same_bit_for_bit_however_often_and_on_however_many_co
 
 
 STRIDES = {
-    "transposed": lambda t: t.transpose(-1, -2).contiguous().transpose(-1, -2),
+    "transposed": lambda t: t.mT.contiguous().mT if t.ndim > 1 else t.repeat_interleave(2)[::2],
     "every other": lambda t: torch.stack([t, torch.full_like(t, float("nan"))], -1)[..., 0],
     "batch expanded": lambda t: t[:1].expand_as(t),
     "last expanded": lambda t: t[..., :1].expand_as(t),
