@@ -231,8 +231,10 @@ class Mesh:
         """
         _check_pose(pose)
         for name, table in (("elevations", elevations), ("azimuths", azimuths)):
-            if table.ndim != 1 or len(table) == 0 or not table.isfinite().all():
-                raise ValueError(f"{name} has shape {tuple(table.shape)}; it should be (N,), of N > 0 finite numbers")
+            if table.ndim != 1 or len(table) == 0:
+                raise ValueError(f"{name} has shape {tuple(table.shape)}; it should be (N,) with N > 0")
+            if not table.isfinite().all():
+                raise ValueError(f"{name} holds NaN or infinite values; it should be finite")
         _check_range(max_range)
         if (steepest := float(elevations.abs().max())) > math.pi / 2:
             raise ValueError(f"elevations reaches {steepest} rad; it should lie within ±π/2")
@@ -265,8 +267,10 @@ class Mesh:
 
 
 def _check_pose(pose: torch.Tensor) -> None:
-    if pose.shape != (4, 4) or not pose.isfinite().all():
-        raise ValueError(f"pose has shape {tuple(pose.shape)}; it should be (4, 4), of finite numbers")
+    if pose.shape != (4, 4):
+        raise ValueError(f"pose has shape {tuple(pose.shape)}; it should be (4, 4)")
+    if not pose.isfinite().all():
+        raise ValueError("pose holds NaN or infinite values; it should be finite")
     numbers = pose.numpy(force=True).astype(np.float64)
     rotation = numbers[:3, :3]
     skew = np.abs(rotation @ rotation.T - np.eye(3)).max()

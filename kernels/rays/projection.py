@@ -50,6 +50,9 @@ def cluster_triangles(vertices: torch.Tensor, triangles: torch.Tensor) -> Cluste
     Args:
         vertices: (V, 3) float32, metres.
         triangles: (F, 3) int32, numbers of the vertices.
+
+    Returns:
+        The triangles in clusters, in the frame of the vertices.
     """
     corners = vertices[triangles.long()]
     middle = corners.mean(1)
@@ -299,12 +302,12 @@ def project_triangles(
     azimuths, column_order = azimuths.to(device).double().sort()
     slopes, row_order = elevations.to(device).double().tan().float().sort()
     seen = _seen(clusters, origin, rotation, elevations, max_range)
-    corners = torch.empty(len(seen) * int(_SIZE), 3, 3, device=device)
+    corners = clusters.corners.new_empty(len(seen) * int(_SIZE), 3, 3)
     columns = torch.empty(len(corners), 2, dtype=torch.int32, device=device)
     placement = [wp.vec3(*origin.tolist()), wp.mat33(*rotation.T.flatten().tolist())]
     inputs = [seen, clusters.corners, *placement, azimuths.float(), slopes, max_range]
     launch(_find_columns_kernel, len(corners), inputs, [corners, columns])
-    ranges = torch.empty(len(azimuths), len(slopes), device=device)
+    ranges = slopes.new_empty(len(azimuths), len(slopes))
     tables = [azimuths.sin().float(), azimuths.cos().float(), slopes]
     blocks = _BLOCKS_PER_CORE * torch.get_num_threads() if device.type == "cpu" else len(azimuths)
     span = -(-len(azimuths) // blocks)
@@ -316,7 +319,7 @@ def project_triangles(
 
 
 def within_reach(clusters: Clusters, origin: torch.Tensor, max_range: float) -> int:
-    """Counts the triangles in clusters that begin within `max_range` [m] of an origin (3,) [m]."""
+    """Returns how many triangles are in clusters that begin within `max_range` [m] of an origin (3,) [m]."""
     distance = (clusters.centres - origin.float()).norm(dim=1)
     return int((distance - clusters.radii <= max_range).sum()) * int(_SIZE)
 

@@ -75,6 +75,19 @@ def test_nothing_is_nearer_than_the_nearest_or_farther_than_the_limit(device):
     assert torch.equal(near, far.where(far <= 20, 0.0))
 
 
+def test_torchs_default_dtype_does_not_matter(device):
+    mesh = soup(device, count=50)
+    tables = TABLES["uneven sector"]
+    rays = turned()[:3, 3].float().to(device), torch.eye(3).to(device), 60.0
+    expected = mesh.project(turned(), *tables, 60.0), *mesh.cast(*rays)
+    torch.set_default_dtype(torch.float64)
+    try:
+        ours = mesh.project(turned(), *tables, 60.0), *mesh.cast(*rays)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert all(torch.equal(a, b) for a, b in zip(ours, expected, strict=True))
+
+
 def test_any_number_of_cores_gives_the_same(device):
     mesh, cores = soup(device), torch.get_num_threads()
     expected = mesh.project(turned(), *TABLES["uneven sector"], 60.0)
@@ -91,7 +104,8 @@ def test_any_number_of_cores_gives_the_same(device):
     [
         ((torch.eye(3), torch.zeros(2), torch.zeros(2), 9.0), r"pose has shape \(3, 3\)"),
         ((torch.eye(4), torch.zeros(0), torch.zeros(2), 9.0), r"elevations has shape \(0,\)"),
-        ((torch.eye(4), torch.zeros(2), torch.tensor([math.nan]), 9.0), "azimuths has shape"),
+        ((torch.eye(4), torch.zeros(2), torch.tensor([math.nan]), 9.0), "azimuths holds NaN"),
+        ((math.nan * torch.eye(4), torch.zeros(2), torch.zeros(2), 9.0), "pose holds NaN"),
         ((torch.eye(4), torch.zeros(2), torch.zeros(2), 0.0), "max_range is 0.0"),
         (
             (torch.zeros(4, 4), torch.zeros(2), torch.zeros(1), 9.0),
