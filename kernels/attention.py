@@ -20,11 +20,11 @@ from kernels.checks import check_backend, check_floating
 from kernels.launch import launch, overload
 from kernels.vmap import fold_into_batch
 
-__all__ = ["adj_logits", "attend_neighbours", "softmax_rows"]
+__all__ = ["attend_neighbours"]
 
 
 @wp.func
-def softmax_rows(logits: Any):
+def _softmax_rows(logits: Any):
     """Attention map P (4, 4) from the logits q kᵀ / √D."""
     p = logits
     for i in range(4):
@@ -38,7 +38,7 @@ def softmax_rows(logits: Any):
 
 
 @wp.func
-def adj_logits(p: Any, adj_p: Any):
+def _adj_logits(p: Any, adj_p: Any):
     """S, the gradient of the logits, from P and the gradient G vᵀ of P."""
     s = adj_p
     for i in range(4):
@@ -66,7 +66,7 @@ def _attention_map(qkv: wp.array4d[Any], n: int, h: int, scale: Any):
     logits = wp.matrix(shape=(4, 4), dtype=type(scale))
     for d in range(qkv.shape[3]):
         logits = logits + wp.outer(_four(qkv, n, 3, 0, h, d, scale) * scale, _four(qkv, n, 3, 1, h, d, scale))
-    return softmax_rows(logits)
+    return _softmax_rows(logits)
 
 
 @wp.kernel(enable_backward=False)
@@ -105,7 +105,7 @@ def _attend_neighbours_backward_kernel(
     adj_p = wp.matrix(shape=(4, 4), dtype=type(scale))
     for d in range(qkv.shape[3]):
         adj_p = adj_p + wp.outer(_four(adj_attended, n, 1, 0, h, d, scale), _four(qkv, n, 3, 2, h, d, scale))
-    s = adj_logits(p, adj_p) * scale
+    s = _adj_logits(p, adj_p) * scale
     for d in range(qkv.shape[3]):
         adj_q = s * _four(qkv, n, 3, 1, h, d, scale)
         adj_k = wp.transpose(s) * _four(qkv, n, 3, 0, h, d, scale)

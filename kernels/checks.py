@@ -1,9 +1,9 @@
 """What every op asks of its arguments, and the constants that ops share with their plain PyTorch twins.
 
-A public op checks its arguments first, with `check_backend`, `check_floating` (type and dtype), `check_queries` and
-`check_devices`. Then `broadcast_batch` gives all its tensors one batch dimension. Behind that point nothing is checked
-again, except that `kernels.launch.launch` compares devices. An error names the argument, what it is, and what it should
-be.
+A public op checks its arguments first: its options with `check_backend`, `check_prior` and `check_area_floor`, its
+tensors with `check_floating` (type and dtype), `check_queries` and `check_devices`. Then `broadcast_batch` gives all
+tensors one batch dimension. Behind that point nothing is checked again, except that `kernels.launch.launch` compares
+devices. An error names the argument, what it is, and what it should be.
 """
 
 from collections.abc import Iterable
@@ -26,9 +26,11 @@ __all__ = [
     "TOLERANCE",
     "WIDEST_GAP",
     "broadcast_batch",
+    "check_area_floor",
     "check_backend",
     "check_devices",
     "check_floating",
+    "check_prior",
     "check_queries",
 ]
 
@@ -65,7 +67,17 @@ TOLERANCE = 0.1
 
 
 def check_floating(name: str, tensor: object, dtypes: Iterable[torch.dtype], shape: str) -> None:
-    """Raises TypeError unless `tensor`, the argument called `name`, is a tensor of one of `dtypes`."""
+    """Checks the type and the dtype of an argument.
+
+    Args:
+        name: The argument's name.
+        tensor: What was passed.
+        dtypes: The dtypes that the op takes.
+        shape: The argument's shape in the words of the docstring. Only the error needs it; the shape is not checked.
+
+    Raises:
+        TypeError: If `tensor` is not a tensor of one of `dtypes`.
+    """
     dtypes = list(dtypes)
     if not isinstance(tensor, torch.Tensor) or tensor.dtype not in dtypes:
         kind = getattr(tensor, "dtype", type(tensor).__name__)
@@ -79,11 +91,26 @@ def check_backend(backend: str) -> None:
         raise ValueError(f"backend is {backend!r}; it should be one of {', '.join(BACKENDS)}")
 
 
+def check_prior(prior: str) -> None:
+    """Raises ValueError unless `prior` is one of `PRIORS`."""
+    if prior not in PRIORS:
+        raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}")
+
+
+def check_area_floor(area_floor: float) -> None:
+    """Raises ValueError unless `area_floor` is at least 0 and at most the area midway between pixels."""
+    if not 0 <= area_floor <= 0.25:
+        raise ValueError(f"area_floor is {area_floor}; it should be between 0 and 0.25, the area midway between pixels")
+
+
 def check_devices(**tensors: torch.Tensor) -> None:
-    """Raises ValueError unless all tensors are on one device, whose index counts: cuda:0 is not cuda:1.
+    """Checks that all tensors are on one device. The index counts: cuda:0 is not cuda:1.
 
     Args:
         **tensors: The tensors by the names of the arguments.
+
+    Raises:
+        ValueError: If a tensor is on another device than the first.
     """
     first, device = None, None
     for name, tensor in tensors.items():
@@ -94,7 +121,15 @@ def check_devices(**tensors: torch.Tensor) -> None:
 
 
 def check_queries(queries: torch.Tensor) -> None:
-    """Raises unless `queries` is a floating-point tensor (..., Q, 2)."""
+    """Checks the queries of an op.
+
+    Args:
+        queries: (..., Q, 2) pixel coordinates (row, column).
+
+    Raises:
+        TypeError: If `queries` is not a floating-point tensor.
+        ValueError: If its shape is another one.
+    """
     if not isinstance(queries, torch.Tensor):
         raise TypeError(f"queries is {type(queries).__name__}; it should be a torch.Tensor (..., Q, 2)")
     if queries.ndim < 2 or queries.shape[-1] != 2:

@@ -24,9 +24,11 @@ from kernels.checks import (
     PRIORS,
     RANGE_FLOOR,
     broadcast_batch,
+    check_area_floor,
     check_backend,
     check_devices,
     check_floating,
+    check_prior,
     check_queries,
 )
 from kernels.lanes import exp2
@@ -351,10 +353,8 @@ def gather_blend(
     Source: paper Eq. 3 (`prior="none"`); the priors are ours.
     """
     check_backend(backend)
-    if prior not in PRIORS:
-        raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}")
-    if not 0 <= area_floor <= 0.25:
-        raise ValueError(f"area_floor is {area_floor}; it should be between 0 and 0.25, the area midway between pixels")
+    check_prior(prior)
+    check_area_floor(area_floor)
     check_floating("image", image, [torch.float32, torch.float64], "(..., H, W)")
     check_floating("scores", scores, [dtype for dtype, _ in _blend], "(..., Q, 4)")
     if image.ndim < 2 or 0 in image.shape[-2:]:

@@ -30,6 +30,7 @@ from kernels.checks import (
     RANGE_FLOOR,
     SHARPEST,
     broadcast_batch,
+    check_area_floor,
     check_backend,
     check_devices,
     check_floating,
@@ -208,8 +209,7 @@ def plane_prior(
     check_floating("image", image, list(_kernels), "(..., H, W)")
     if image.ndim < 2 or 0 in image.shape[-2:]:
         raise ValueError(f"image has shape {tuple(image.shape)}; it should be (..., H, W), neither of them 0")
-    if not 0 <= area_floor < 0.25:
-        raise ValueError(f"area_floor is {area_floor}; it should be at least 0 and below 0.25")
+    check_area_floor(area_floor)
     if not sharpness >= 1:
         raise ValueError(f"sharpness is {sharpness}; it should be at least 1")
     check_queries(queries)

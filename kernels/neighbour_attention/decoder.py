@@ -19,7 +19,15 @@ import torch
 import warp as wp
 
 from kernels import reference
-from kernels.checks import PRIORS, RANGE_FLOOR, check_backend, check_devices, check_queries
+from kernels.checks import (
+    PRIORS,
+    RANGE_FLOOR,
+    check_area_floor,
+    check_backend,
+    check_devices,
+    check_prior,
+    check_queries,
+)
 from kernels.lanes import LANES, add_products, gelu, rsqrt, total, vectors
 from kernels.launch import launch
 from kernels.neighbour_attention.maths import PIXEL_TABLES, attend, stencil
@@ -284,13 +292,13 @@ def fused_decode(
 
     Raises:
         TypeError: If `queries` is not a floating-point tensor.
-        ValueError: If the table is not served, or a shape, device, prior or backend does not fit.
+        ValueError: If the table is not served, or a shape, device, prior, floor or backend does not fit.
 
     Source: paper Fig. 3 and Eq. 3.
     """
     check_backend(backend)
-    if prior not in PRIORS:
-        raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}")
+    check_prior(prior)
+    check_area_floor(area_floor)
     check_queries(queries)
     tensors = {"image": image, "queries": queries} | ({} if added is None else {"added": added})
     check_devices(**projected.named(), **tensors, **weights.named())

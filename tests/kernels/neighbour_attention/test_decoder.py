@@ -119,6 +119,8 @@ def test_what_it_does_not_serve_is_named():
         fused_decode(projected, image[:, :4], queries, weights)
     with pytest.raises(ValueError, match="prior is 'cubic'"):
         fused_decode(projected, image, queries, weights, "cubic")
+    with pytest.raises(ValueError, match=r"area_floor is 0\.5; it should be between 0 and 0\.25"):
+        fused_decode(projected, image, queries, weights, area_floor=0.5)
     with pytest.raises(ValueError, match=r"queries has shape \(500, 2\)"):
         fused_decode(projected, image, queries[0], weights)
 
