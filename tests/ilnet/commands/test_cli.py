@@ -216,7 +216,7 @@ BAD = {
     "unknown preset": (["train", "iln", "--preset", "huge"], "unknown preset 'huge'"),
     "no steps": (["train", "iln", "--steps", "0"], "--steps"),
     "size of no images": (["train", "iln", "--size", "64x1024"], "--size goes with --data DIR"),
-    "unknown sensor to train on": (["train", "iln", "--sensors", "os1-128,os9"], "unknown sensor 'os9'"),
+    "unknown sensor to train on": (["train", "iln", "--sensors", "os1-128,os9"], "sensor is 'os9'; it should be one"),
     "sensors of stored images": (["train", "iln", "--sensors", "any", "--data", "x"], "--sensors and --data exclude"),
     "lidar-sr on rays": (["train", "lidar-sr"], "lidar-sr with preset tiny learns from stored images"),
     "no experiment": (["experiment"], "name some experiments, or all"),
