@@ -1,4 +1,4 @@
-"""Training with Lightning: L1 on normalised ranges (paper, Sec. III-B).
+"""Training with Lightning: the loss of each model, by default L1 on normalised ranges (paper, Sec. III-B).
 
 A network learns from rays that are cast at continuous directions while it trains or, as in the paper, from pixels of
 images stored on disk. Under `torchrun` several processes share each batch.
@@ -36,8 +36,8 @@ HELD_OUT = {"town01": 1, "town03": 1, "town05": 1}
 HELD_OUT_SCANS = 4
 # Sensors that a network for any sensor is validated with as well, a quarter of their beams kept, once in each town.
 HELD_OUT_SENSORS = "hdl-64e", "os0-128", "os1-64"
-# Highest learning rate, and the gradient norm that is clipped, of networks that want their own: the likelihood is steep
-# where a network is sure, and at a rate of 1e-3 long runs collapse.
+# Limits of some networks: the highest learning rate, and the gradient norm to which longer gradients are clipped. The
+# likelihood is steep where a network is sure, and at a rate of 1e-3 long runs collapse.
 RATES = {"iln-surfaces": 4e-4}
 LARGEST_GRADIENT = {"iln-surfaces": 10.0}
 PRECISION: Any = "bf16-mixed"
@@ -103,12 +103,12 @@ class Training(lightning.LightningModule):
     """One network, its loss, its schedule and its validation.
 
     Args:
-        model: The model to train; its `norm_range` is above 0.
+        model: The model to train, see `Model.loss`.
         held_out: Pairs of an input scan and the scan to be predicted.
         rate: Highest learning rate.
         halve_after: Steps after which the rate is halved; if empty, it follows one cycle.
         run: What tells this run from others; kept in its checkpoints.
-        probe: More such pairs; their figures are logged and decide nothing.
+        probe: More such pairs. Their figures are logged and decide nothing.
     """
 
     def __init__(
@@ -215,7 +215,8 @@ def train(
 
     Raises:
         ValueError: If there is no such model or preset, images are missing or of a size that does not fit, `out` holds
-            an interrupted run of another kind, a process has no GPU of its own, or a loss is not finite.
+            an interrupted run of another kind, there are `sensors` as well as an `archive`, a process has no GPU of its
+            own, or a loss is not finite.
     """
     plan = _plan(name, preset_name, steps, seed, archive, target, sensors, arguments)
     start = _steps_done(out / name / "last.ckpt", plan.run)
@@ -244,7 +245,7 @@ class _Plan:
     """Steps in which each stored scan is seen once."""
     target: tuple[int, int]
     sensors: Sequence[Sensor]
-    """Of the continuous rays; any where there is none."""
+    """Input sensors of the continuous rays; if empty, each batch has one that is made up."""
     run: dict[str, Any]
     """What tells this run from others; kept in its checkpoints and beside its weights."""
 
@@ -275,16 +276,19 @@ def _plan(
         if target[0] % source[0] or target[1] % source[1]:
             raise ValueError(f"target is {wanted}; for lidar-sr it should be a multiple of {given}")
         arguments = {"rows": target[0] // source[0], "columns": target[1] // source[1], **arguments}
+    if archive is not None and sensors is not None:
+        raise ValueError("sensors is given; it should be None with an archive, whose images have their own sensor")
     stored = None if archive is None else data.open_archive(archive)
     per_epoch = -(-len(stored) // size.crops) if stored else 0
     steps = steps or size.steps or size.epochs * per_epoch
     arguments = {**size.arguments(name), **arguments}
-    learns_from = f"{wanted} of {archive}" if archive else "continuous rays"
+    learns_from: dict[str, Any] = {"data": f"{wanted} of {archive}"}
     if sensors is None:
         sensors = () if name == "iln-surfaces" else (PAPER_INPUT,)
-    sensors = [sensor.upright() for sensor in sensors]
-    names = [sensor.name or format_size(sensor.shape) for sensor in sensors] or ["any"]
-    run = {"preset": preset_name, "steps": steps, "seed": seed, "data": learns_from, "sensors": names, **arguments}
+    if archive is None:
+        names = [sensor.name or sensor.size for sensor in sensors] or ["any"]
+        learns_from = {"data": "continuous rays", "sensors": names}
+    run = {"preset": preset_name, "steps": steps, "seed": seed, **learns_from, **arguments}
     return _Plan(name, size, arguments, steps, seed, stored, per_epoch, target, sensors, run)
 
 
@@ -298,12 +302,12 @@ def _build(
     samples = _samples(plan, start, part, device)
     held_out = [
         (scan, truth)
-        for town, held_out_seed in HELD_OUT.items()
+        for place in (places.town(town, held_out_seed, device) for town, held_out_seed in HELD_OUT.items())
         for source, wanted, count in _validation(plan)
-        for scan, truth in places.held_out_scans(places.town(town, held_out_seed, device), count, [source, wanted])
+        for scan, truth in places.held_out_scans(place, count, [source, wanted])
     ]
     halve_after = [epoch * plan.per_epoch for epoch in plan.size.halve_after]
-    rate = RATES.get(plan.name, plan.size.rate)
+    rate = min(plan.size.rate, RATES.get(plan.name, math.inf))
     training = Training(model, held_out, rate, halve_after, plan.run, probe)
     number, processes = part
     numbered = [(kind, i) for kind, pairs in training.pairs.items() for i in range(number, len(pairs), processes)]
@@ -405,7 +409,10 @@ class _Watch(lightning.Callback):
         process = f"-process-{trainer.global_rank}" if trainer.world_size > 1 else ""
         file = self.folder / f"step-{step}{process}.pt"
         file.parent.mkdir(parents=True, exist_ok=True)
-        torch.save({"batch": batch._asdict(), "model": self.weights}, file)
+        # Plain values, since `torch.load` refuses classes. `Sensor(**...)` makes the sensor again.
+        sensor = {key: getattr(batch.sensor, key) for key in ("min_range", "max_range", "norm_range", "name")}
+        sensor |= {key: torch.tensor(getattr(batch.sensor, key)) for key in ("elevations", "azimuths")}
+        torch.save({"batch": batch._asdict() | {"sensor": sensor}, "model": self.weights}, file)
         raise ValueError(
             f"the loss of step {step} is {loss:g}; it should be finite: "
             f"{file} holds the batch, and the weights of step {start}"
@@ -433,7 +440,7 @@ class _Last(Checkpoint):
 
 
 def _validation(plan: _Plan) -> list[tuple[Sensor, Sensor, int]]:
-    """Returns the sensors that validate a training: what is seen, what is to be predicted, and of how many scans."""
+    """Returns what validates a training: the input sensor, the sensor to predict, and the number of scans per town."""
     if plan.name == "lidar-sr":
         return [(PAPER_INPUT, PAPER_INPUT.resize(*plan.target), HELD_OUT_SCANS)]
     others = [] if plan.sensors else [preset(name) for name in HELD_OUT_SENSORS]

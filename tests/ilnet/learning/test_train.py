@@ -14,7 +14,7 @@ from torch.utils.data import get_worker_info
 
 from ilnet import data, models
 from ilnet.learning import metrics, train
-from ilnet.sensor import PAPER_INPUT, preset
+from ilnet.sensor import PAPER_INPUT, Sensor, preset
 from ilnet.world import places, simulate
 from ilnet.world.simulate import pose
 
@@ -70,6 +70,16 @@ def test_the_sensors_of_a_training_can_be_chosen(tmp_path, quick):
     quick(tmp_path, "iln-surfaces", tokens=8, sensors=[preset("os1-32")])
     with safe_open(tmp_path / "iln-surfaces.safetensors", "pt") as file:
         assert json.loads(file.metadata()["sensors"]) == ["os1-32"]
+
+
+def test_the_rate_of_surfaces_is_at_most_that_of_the_preset(tmp_path, quick, monkeypatch):
+    for rate in (1e-4, 1e-3):
+        monkeypatch.setitem(train.PRESETS, "tiny", dataclasses.replace(train.PRESETS["tiny"], rate=rate))
+        rates = []
+        monkeypatch.setattr(train, "_run", lambda plan, training, *_, to=rates: to.append(training.rate) or {})
+        quick(tmp_path, "iln-surfaces", tokens=8)
+        quick(tmp_path)
+        assert rates == [min(rate, train.RATES["iln-surfaces"]), rate]
 
 
 def test_a_training_on_any_sensor_goes_on_exactly(tmp_path, quick, monkeypatch):
@@ -188,7 +198,8 @@ def test_the_loss_is_in_units_of_the_normalised_range(yard):
     model = models.create("iln", features=16, blocks=1, heads=4).eval()
     training = train.Training(model, [], 1e-3)
     training.log = lambda *args, **kwargs: None
-    batch = data.Batch(torch.full((1, 4, 8), 20.0), torch.rand(1, 5, 2) * 3, torch.full((1, 5), 70.0), False)
+    image, truth = torch.full((1, 4, 8), 20.0), torch.full((1, 5), 70.0)
+    batch = data.Batch(image, torch.rand(1, 5, 2) * 3, truth, False, PAPER_INPUT.resize(4, 8))
     assert training.training_step(batch, 0).item() == pytest.approx(50 * 2 / 100)
 
 
@@ -243,6 +254,7 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_batch(tmp_path, quick, mo
         quick(tmp_path)
     kept = torch.load(tmp_path / "iln-prior" / "step-2.pt")
     assert kept["batch"]["ranges"].isnan().any()
+    assert Sensor(**kept["batch"]["sensor"]).shape == tuple(kept["batch"]["image"].shape[1:])
     first = models.create("iln-prior", blocks=1, features=16, heads=4)
     assert kept["model"].keys() == first.state_dict().keys()
     assert all(weight.isfinite().all() for weight in kept["model"].values())
@@ -318,6 +330,8 @@ def test_stored_images_are_learned_from(tmp_path, quick, monkeypatch):
         train.train("lidar-sr", "tiny", tmp_path, target=(64, 1024))
     with pytest.raises(ValueError, match=r"target is 70x1024; for lidar-sr it should be a multiple of 16x1024"):
         train.train("lidar-sr", "tiny", tmp_path, archive=tmp_path / "data", target=(70, 1024))
+    with pytest.raises(ValueError, match="sensors is given; it should be None with an archive"):
+        quick(tmp_path / "out2", archive=tmp_path / "data", sensors=[PAPER_INPUT])
     with pytest.raises(FileNotFoundError, match="no such folder"):
         quick(tmp_path / "out2", archive=tmp_path / "nothing")
 
