@@ -188,7 +188,8 @@ def evaluate(
         if scans and scans > len(positions):
             raise click.UsageError(f"--scans is {scans}, but {at} holds {len(positions)} positions")
         pairs = evaluate.mesh_pairs(mesh, positions[:scans], output)
-    results = evaluate.measure(loaded, pairs)
+    device = pairs[0][0].ranges.device
+    results = evaluate.measure({name: model.to(device) for name, model in loaded.items()}, pairs)
     if as_json:
         click.echo(json.dumps(results[0] if len(results) == 1 else results))
         return

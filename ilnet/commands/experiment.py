@@ -23,7 +23,7 @@ from ilnet.commands import plot
 from ilnet.learning import evaluate, train
 from ilnet.scan import Pair
 from ilnet.sensor import PAPER_INPUT, format_size
-from ilnet.world import towns
+from ilnet.world import simulate, towns
 
 __all__ = ["EXPERIMENTS", "Study", "results"]
 
@@ -112,7 +112,7 @@ class Study:
         self, files: Mapping[str, str | Path | models.Model], sizes: Sequence[tuple[int, int]] = ()
     ) -> list[dict[str, Any]]:
         """Measures models in the test towns, at all `SIZES` by default; their rows bear the names in `files`."""
-        loaded = {label: f if isinstance(f, models.Model) else models.load(f) for label, f in files.items()}
+        loaded = _loaded(files)
         rows = []
         for size in sizes or SIZES:
             output = PAPER_INPUT.resize(*size)
@@ -145,6 +145,12 @@ class Study:
             writer.writerows(
                 {key: round(v, 4) if isinstance(v, float) else v for key, v in row.items()} for row in rows
             )
+
+
+def _loaded(files: Mapping[str, str | Path | models.Model]) -> dict[str, models.Model]:
+    """Returns models where the scans of `evaluate` are."""
+    found = {label: file if isinstance(file, models.Model) else models.load(file) for label, file in files.items()}
+    return {label: model.to(simulate.best_device()) for label, model in found.items()}
 
 
 def table(study: Study) -> None:
@@ -343,7 +349,7 @@ def real(study: Study) -> None:
         raise ValueError("no measured scans are named: give some with --measured FILE, such as frames of your sensor")
     files: dict[str, str | Path] = {name: name for name in ("bilinear", "bilinear-inverse", "planes")}
     files |= study.networks()
-    loaded = {label: models.load(file) for label, file in files.items()}
+    loaded = _loaded(files)
     rows = []
     for path in study.measured:
         beams = scan_files.read(path).sensor.shape[0]

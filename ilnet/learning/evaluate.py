@@ -1,4 +1,7 @@
-"""Models measured anywhere: pairs of what a model sees and what it should predict, and the means over them."""
+"""Measuring models: pairs of what a model sees and what it should predict, and mean figures over such pairs.
+
+The pairs that are made here are on `simulate.best_device()`.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -71,7 +74,7 @@ def scan_pair(path: Path, rows: int, sensor: str | None = None) -> Pair:
 
     Args:
         path: A scan file; see `ilnet.scan_files.read`.
-        rows: Number of beams to keep.
+        rows: Number of beams to keep, fewer than the scan has.
         sensor: Name of the preset with the file's angles, where the file does not hold them.
 
     Raises:
@@ -97,22 +100,23 @@ def measure(loaded: Mapping[str, models.Model], pairs: Sequence[Pair]) -> list[d
     """Measures models, with a progress bar on stderr.
 
     Args:
-        loaded: The models, by their names in the results.
-        pairs: At least one pair of what a model sees and what it should predict, all of the same two sensors.
+        loaded: The models, by their names in the results, on the device of the scans.
+        pairs: At least one pair of what a model sees and what it should predict, all of the same two sensors and on one
+            device.
 
     Returns:
         For each model its name as `model`, the `size` of its predictions, the number of `scans`, and the means over
         them of `mae`, `edge_mae` [m], `iou`, `precision`, `recall`, `f1` and `floating`; see `metrics.compare`.
 
     Raises:
-        ValueError: If a model cannot predict this sensor.
+        ValueError: If a model is not on the scans' device, or cannot predict this sensor.
     """
     scan, truth = pairs[0]
     device = scan.ranges.device
     results = []
     with tqdm(total=len(loaded) * len(pairs), unit="scan", desc="evaluate") as progress:
         for name, model in loaded.items():
-            frames = models.Upsampler(model.to(device), scan.sensor, truth.sensor, device=device)
+            frames = models.Upsampler(model, scan.sensor, truth.sensor, device=device)
             mean = metrics.ScanMetrics().to(device)
             for sparse, dense in pairs:
                 mean.update(frames.ranges(sparse), dense)

@@ -1,0 +1,32 @@
+import pytest
+
+from ilnet import models
+from ilnet.learning import evaluate
+from ilnet.scan import Scan
+from ilnet.sensor import PAPER_INPUT
+from ilnet.world import simulate
+
+
+@pytest.fixture
+def pair(yard):
+    here = simulate.pose((0.0, 0.0, 1.8))
+    return tuple(simulate.scan(yard, PAPER_INPUT.resize(*size), here) for size in ((8, 256), (32, 256)))
+
+
+def test_measures_each_model_over_all_pairs(pair):
+    scan, truth = pair
+    empty = Scan(scan.ranges, scan.sensor), Scan(truth.ranges * 0, truth.sensor)
+    loaded = {"one": models.load("nearest"), "other": models.load("bilinear-inverse")}
+    one, other = evaluate.measure(loaded, [pair])
+    assert (one["model"], other["model"]) == ("one", "other")
+    assert (one["size"], one["scans"]) == ("32x256", 1)
+    assert other["iou"] > one["iou"] > 0  # most of the yard is a plane
+    both = evaluate.measure(loaded, [pair, empty])
+    assert [row["iou"] for row in both] == pytest.approx([one["iou"] / 2, other["iou"] / 2])
+
+
+def test_a_model_elsewhere_is_refused_and_stays_there(pair):
+    model = models.create("iln", features=16, blocks=1, heads=4).to("meta")
+    with pytest.raises(ValueError, match="model is on meta; it should be on cpu"):
+        evaluate.measure({"iln": model}, [pair])
+    assert {weight.device.type for weight in model.parameters()} == {"meta"}
