@@ -154,12 +154,19 @@ class Sensor:
         return angles_to_directions(elevations[:, None], azimuths[None, :]).float()
 
     def angles(self, device: torch.device | str = "cpu") -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns the elevations (H,) and azimuths (W,) as float32 tensors [rad] on a device, made once for each."""
+        """Returns the elevations (H,) and azimuths (W,) as float32 tensors [rad] on a device.
+
+        They are made once for each device, since a CUDA graph cannot copy from the host while it is recorded. So they
+        are shared and must not be changed.
+        """
         key = str(device)
         if key not in self._tensors:
-            elevations, azimuths = (
-                torch.tensor(table, dtype=torch.float32, device=device) for table in (self.elevations, self.azimuths)
-            )
+            # Inference may ask first, and training later: it cannot save tensors that inference mode made.
+            with torch.inference_mode(False):
+                elevations, azimuths = (
+                    torch.tensor(table, dtype=torch.float32, device=device)
+                    for table in (self.elevations, self.azimuths)
+                )
             self._tensors[key] = elevations, azimuths
         return self._tensors[key]
 

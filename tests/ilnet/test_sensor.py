@@ -417,3 +417,25 @@ def test_a_size_is_text_both_ways():
 def test_what_is_no_size(size):
     with pytest.raises(ValueError, match=f"size is '{size}'; it should be rows x columns, at least 2 of each"):
         parse_size(size)
+
+
+def test_an_upright_sensor_has_the_same_rays_in_rising_order():
+    hung = preset("os1-32")
+    upright = hung.upright()
+    assert np.array_equal(upright.elevations, hung.elevations[::-1])
+    assert np.array_equal(upright.azimuths, hung.azimuths[::-1])
+    assert (upright.name, upright.max_range, upright.wrap) == (hung.name, hung.max_range, hung.wrap)
+    assert upright.upright() == upright
+
+
+def test_angles_are_made_once_and_serve_training_after_inference():
+    sensor = preset("os1-32").resize(4, 16)
+    with torch.inference_mode():
+        elevations, azimuths = sensor.angles()
+    assert np.allclose(elevations.numpy(), sensor.elevations, atol=1e-6)
+    assert np.allclose(azimuths.numpy(), sensor.azimuths, atol=1e-6)
+    assert all(again is table for again, table in zip(sensor.angles(), (elevations, azimuths), strict=True))
+    scale = torch.ones((), requires_grad=True)
+    (scale * elevations).sum().backward()
+    assert scale.grad.item() == pytest.approx(sensor.elevations.sum(), abs=1e-5)
+    assert {table.device.type for table in sensor.angles("meta")} == {"meta"}
