@@ -14,7 +14,7 @@ import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
 from ilnet.data.archive import Archive
-from ilnet.data.random_sensors import draw_effects, draw_sensor
+from ilnet.data.random_sensors import COLUMNS, draw_effects, draw_sensor
 from ilnet.data.rimg import RangeImageTree
 from ilnet.sensor import Sensor, angles_to_directions
 from ilnet.world import simulate
@@ -48,20 +48,24 @@ class ContinuousRays(IterableDataset):
 
     Each crop has a place, a waypoint, a height, a yaw, a tilt and traffic of its own. A query's direction is uniform
     between the beams of the sensor and in azimuth: no stored image contains it. Rays are cast when a batch is asked
-    for, on the device of the places: on a GPU, or on the CPU, where the workers of a `DataLoader` take turns. The
-    batches are the same for any number of workers.
+    for, on the device of the places. On the CPU the workers of a `DataLoader` take turns, and any number of them gives
+    the same batches. The tensors of a batch are on the CPU.
 
     Args:
         places: Where scans are taken, all on one device; each is drawn equally often.
-        sensors: The input sensor, or several of which each batch has one; lowest beam first, azimuths rising. If empty,
-            `draw_sensor` makes one up for each batch, and `draw_effects` what it does to the images; the ranges to be
-            predicted stay clean.
+        sensors: The input sensor, or several, of which each batch has one; they are turned upright. If there is none,
+            `draw_sensor` makes one up for each batch, and `draw_effects` says what it does to the images. The ranges to
+            be predicted stay clean.
         crops: Number B of crops in a batch.
         columns: Number W of columns in a crop.
         queries: Number Q of rays per crop.
         seed: Seed of the random numbers; a batch depends on the seed and on its number.
         start: Number of the first batch, for a training that goes on.
         part: (i, n): cast part i, counted from 0, of n equal parts of each batch, for training in several processes.
+
+    Raises:
+        ValueError: If a sensor has fewer columns than a crop, a crop is too narrow for queries, or the crops cannot be
+            shared out equally.
     """
 
     def __init__(
@@ -75,7 +79,11 @@ class ContinuousRays(IterableDataset):
         start: int = 0,
         part: tuple[int, int] = (0, 1),
     ):
-        self.sensors = (sensors,) if isinstance(sensors, Sensor) else tuple(sensors)
+        given = (sensors,) if isinstance(sensors, Sensor) else sensors
+        self.sensors = tuple(sensor.upright() for sensor in given)
+        most = min((sensor.shape[1] for sensor in self.sensors), default=min(COLUMNS))
+        if not 2 * _MARGIN + 2 <= columns <= most:
+            raise ValueError(f"columns is {columns}; it should be {2 * _MARGIN + 2} to {most}, the columns of a sensor")
         self.places, self.crops, self.columns = places, crops, columns
         self.queries, self.seed, self.start = queries, seed, start
         meshes = [place.mesh for place in places]  # made here, once, and not by every worker

@@ -7,21 +7,24 @@ import numpy as np
 from ilnet.sensor import PAPER_INPUT, Sensor
 from ilnet.world.effects import Effects
 
-__all__ = ["draw_effects", "draw_sensor"]
+__all__ = ["COLUMNS", "draw_effects", "draw_sensor"]
 
+COLUMNS = (512, 720, 900, 1024, 1024, 1800, 2048)
+"""Numbers of columns that are drawn."""
 # Share of the draws that are the paper's input sensor.
 _PAPER = 0.3
 _ROWS = (8, 12, 16, 16, 16, 24, 32, 32, 40)
-_COLUMNS = (512, 720, 900, 1024, 1024, 1800, 2048)
 # Degrees: least field of view, most field of view, and the steepest beam up or down.
 _LEAST_VIEW, _MOST_VIEW, _STEEPEST = 10.0, 95.0, 55.0
+# Degrees: least and most mean spacing of the beams.
+_DENSEST, _SPARSEST = 0.3, 6.0
 
 
 def draw_sensor(rng: np.random.Generator) -> Sensor:
-    """Draws a full-circle sensor: rows, field of view, spacing, columns and range limits.
+    """Draws a full-circle sensor: its rows, field of view, spacing, columns and range limits.
 
-    Three tables in ten are the paper's, 16 beams 2 degrees apart. Of the others half have even beams; the rest have two
-    blocks of different density, are densest at some elevation, or vary from beam to beam.
+    Three sensors in ten are `PAPER_INPUT`. Half of the others have evenly spaced beams. In the rest the beams form two
+    blocks of different density, are densest at some elevation, or lie at random.
 
     Args:
         rng: Source of the random numbers.
@@ -32,15 +35,15 @@ def draw_sensor(rng: np.random.Generator) -> Sensor:
     if rng.random() < _PAPER:
         return PAPER_INPUT
     gaps = int(rng.choice(_ROWS)) - 1
-    low, high = max(0.3, _LEAST_VIEW / gaps), min(6.0, _MOST_VIEW / gaps)
-    spacing = math.exp(rng.uniform(math.log(low), math.log(max(low, high))))
+    low, high = max(_DENSEST, _LEAST_VIEW / gaps), min(_SPARSEST, _MOST_VIEW / gaps)
+    spacing = math.exp(rng.uniform(math.log(low), math.log(high)))
     steps = _unevenness(rng, gaps)
     steps *= spacing / steps.mean()
     view = float(steps.sum())
     top = rng.uniform(0.2, 0.8) * view + rng.normal(-3.0, 4.0)
     top = min(_STEEPEST, max(top, view - _STEEPEST))
     elevations = top - view + np.concatenate(([0.0], np.cumsum(steps)))
-    azimuths = np.linspace(-math.pi, math.pi, int(rng.choice(_COLUMNS)), endpoint=False)
+    azimuths = np.linspace(-math.pi, math.pi, int(rng.choice(COLUMNS)), endpoint=False)
     nearest = float(rng.choice([0.3, 0.5, 1.0, 2.0]))
     farthest = math.exp(rng.uniform(math.log(60), math.log(180)))
     return Sensor(np.deg2rad(elevations), azimuths, nearest, farthest, 1.25 * farthest, name="any")
@@ -61,7 +64,14 @@ def _unevenness(rng: np.random.Generator, gaps: int) -> np.ndarray:
 
 
 def draw_effects(rng: np.random.Generator) -> Effects:
-    """Draws what a sensor does to its ranges: noise, and returns lost at random, far away and at grazing angles."""
+    """Draws what a sensor does to its ranges: noise, and returns lost at random, far away and at grazing angles.
+
+    Args:
+        rng: Source of the random numbers.
+
+    Returns:
+        Effects for `spoil`. Noise is off in a fifth of the draws, and losses are off in three tenths.
+    """
     noisy, lossy = rng.random(2) < (0.8, 0.7)
     return Effects(
         range_noise=noisy * rng.uniform(0, 0.03),

@@ -167,18 +167,18 @@ def spoil(
     noise: torch.Tensor,
     luck: torch.Tensor,
 ) -> torch.Tensor:
-    """Adds noise to ranges and loses some of them.
+    """Adds noise to clean ranges, and loses some of them.
 
     Args:
-        effects: Range noise and the three dropouts; the others happen as rays are cast.
+        effects: Its noise and its three dropouts are applied; its other effects happen while rays are cast.
         ranges: (...) clean ranges [m], 0 where nothing returned.
-        cosines: (...) of the angle between beam and surface normal.
-        sensor: The sensor that measures; what falls outside its range limits is no return.
-        noise: (...) numbers from a normal distribution.
-        luck: (...) numbers from 0 to 1; where one is small, the return is lost.
+        cosines: (...) cosines of the angles between beam and surface normal, 0 to 1.
+        sensor: The sensor that measures. Ranges outside its limits, noise included, become no returns.
+        noise: (...) numbers from the standard normal distribution.
+        luck: (...) numbers drawn evenly from 0 to 1. A return is lost where its number is below the probability.
 
     Returns:
-        (...) ranges [m], 0 where nothing returned.
+        (...) ranges [m] on the device of `ranges`, 0 where nothing returned.
     """
     lost_far = effects.dropout_range * (ranges / sensor.max_range) ** 2
     lost_grazing = effects.dropout_incidence * (1 - cosines) ** 2

@@ -26,6 +26,20 @@ def rays(streets, seed=0):
     return data.ContinuousRays(streets, SENSOR, crops=6, columns=64, queries=100, seed=seed)
 
 
+def test_sensors_are_turned_upright(streets):
+    hung = data.ContinuousRays(streets, preset("os1-32"), crops=6, columns=64, queries=100, seed=0)
+    batch = next(iter(hung))
+    assert batch.sensor.elevations[0] < batch.sensor.elevations[-1]
+    assert batch.sensor.azimuths[0] < batch.sensor.azimuths[-1]
+    assert batch.image[:, 0].mean() < batch.image[:, -1].mean()  # the ground is nearer than the sky
+
+
+def test_a_crop_fits_its_sensor_and_has_room_for_queries(streets):
+    for columns, sensors, most in ((17, SENSOR, 1024), (1025, SENSOR, 1024), (513, (), 512)):
+        with pytest.raises(ValueError, match=f"columns is {columns}; it should be 18 to {most}"):
+            data.ContinuousRays(streets, sensors, crops=2, columns=columns, queries=5, seed=0)
+
+
 def test_a_batch_is_what_the_model_takes(streets):
     batch = next(iter(rays(streets)))
     assert batch.image.shape == (6, 16, 64)
