@@ -1,13 +1,12 @@
 """ILN over surfaces: attention among the neighbours weighs what their surfaces say, and predicts how well they know it.
 
-Where the paper's network weighs the ranges of the 4 neighbours, this one weighs where the surfaces that the neighbours
-lie on, continued in 9 ways each, are met along the query (`kernels.surfaces`).
+The paper's network weighs the ranges of the 4 neighbours. This one continues the surfaces that the neighbours lie on, each
+in several ways, and weighs the ranges at which they are met along the query (`kernels.surfaces`).
 """
 
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import nn
 
 from ilnet.models.base import OFFSET_SCALE, Model
@@ -19,10 +18,11 @@ from kernels.checks import KINDS
 
 __all__ = ["Surfaces", "describe"]
 
-CHANNELS = 12
-# Metres. What is farther looks alike to the encoder, and a no return looks like `_NOTHING`.
+# What `describe` returns.
+_CHANNELS = 12
+# Metres. All that is farther looks alike to the encoder. No return looks like a range of `_NOTHING`.
 _FARTHEST, _NOTHING = 200.0, 100.0
-# Radians between rows and between columns that the encoder sees as 0: those of the paper's input.
+# Radians between rows and between columns that the encoder sees as 0: about those of the paper's input.
 _ROW_GAP, _COLUMN_GAP = 0.035, 0.006
 
 
@@ -36,7 +36,10 @@ class _Encoded(NamedTuple):
 
 
 def _shifted(image: torch.Tensor, by: int, axis: int, wrap: bool) -> torch.Tensor:
-    """Returns each pixel's neighbour `by` (1 or -1) before it along an axis; at a border the pixel itself."""
+    """Returns for each pixel of (B, H, W) the one before it (`by` = 1) or after it (-1) along an axis.
+
+    At a border that is the pixel itself.
+    """
     shifted = image.roll(by, axis)
     if not wrap:
         end = 0 if by == 1 else image.shape[axis] - 1
@@ -45,17 +48,17 @@ def _shifted(image: torch.Tensor, by: int, axis: int, wrap: bool) -> torch.Tenso
 
 
 def describe(measured: torch.Tensor, sensor: Sensor, wrap: bool) -> torch.Tensor:
-    """Returns what the encoder sees of ranges: near and far alike, edges, creases, and how dense the rays are.
+    """Returns what the encoder sees of ranges: how far, where edges and creases are, and how dense the rays are.
 
     Args:
         measured: (B, H, W) metres, 0 where nothing returned.
-        sensor: The sensor that measured.
+        sensor: The sensor that measured, with H beams and W columns.
         wrap: Whether column W-1 meets column 0.
 
     Returns:
-        (B, 12, H, W): the range on three scales, whether nothing returned, how the logarithm of the range changes to
-        the four pixels around, curvatures of the inverse range along the column and along the row, and the logarithms
-        of the spacing of rows and of columns.
+        (B, 12, H, W) without a unit. 3 channels hold the range on three scales; 1, whether nothing returned; 4, how the
+        logarithm of the range changes towards the pixels above, below, before and after; 2, the curvature of the
+        inverse range along the column and along the row; 2, the logarithms of the spacing of rows and of columns.
     """
     r = measured.where(measured > 0, _NOTHING).clamp(max=_FARTHEST)
     log, u = r.log(), 1 / r
@@ -67,8 +70,7 @@ def describe(measured: torch.Tensor, sensor: Sensor, wrap: bool) -> torch.Tensor
         curvatures.append((sharpness * (both - 2 * u) * r).tanh())
     elevations, azimuths = sensor.angles(measured.device)
     gaps = elevations.diff().abs()
-    rows = (F.pad(gaps, (1, 0)) + F.pad(gaps, (0, 1))) / 2
-    rows = torch.cat((gaps[:1], rows[1:-1], gaps[-1:])) if len(gaps) > 1 else gaps.expand(2)
+    rows = torch.cat((gaps[:1], (gaps[1:] + gaps[:-1]) / 2, gaps[-1:]))
     spacing = (rows / _ROW_GAP).log() / 2, (azimuths.diff().abs().mean() / _COLUMN_GAP).log() / 2
     density = [gap.view(1, -1, 1).expand_as(r) for gap in spacing]
     scales = [r.clamp(max=1.5 * _NOTHING) / 50 - 1, log / 2 - 1, (5 * u).clamp(max=2), (measured == 0).to(r)]
@@ -76,7 +78,9 @@ def describe(measured: torch.Tensor, sensor: Sensor, wrap: bool) -> torch.Tensor
 
 
 class Surfaces(Model):
-    """r̂ = the weighted median of where the surfaces of the 4 neighbours are met; for any sensor.
+    """r̂ = the weighted median of the ranges at which the surfaces of the 4 neighbours are met; for any sensor.
+
+    It needs the sensor of each image. No return is filled with that sensor's `norm_range`, and predicted as it.
 
     Args:
         features: Channels of the encoder.
@@ -96,7 +100,7 @@ class Surfaces(Model):
             raise ValueError(f"heads is {heads}; it should divide the {tokens} tokens")
         super().__init__()
         self.weight = weight
-        self.encoder = Encoder(features, blocks, CHANNELS)
+        self.encoder = Encoder(features, blocks, _CHANNELS)
         self.reduce = nn.Conv2d(features, tokens, 1)
         self.position = nn.Linear(2, tokens)
         self.block = Block(tokens, heads, 0.0)
@@ -106,9 +110,15 @@ class Surfaces(Model):
         self.head = nn.Sequential(nn.LayerNorm(tokens), score)
 
     def encode(self, image: torch.Tensor, wrap: bool, sensor: Sensor | None = None) -> _Encoded:
-        """Extracts features from ranges (B, H, W) [m] and projects them for the attention."""
+        """Extracts features from ranges (B, H, W) [m] and projects them for the attention.
+
+        Raises:
+            ValueError: If the sensor is None, or its shape is not that of the image.
+        """
         if sensor is None:
             raise ValueError("sensor is None; it should be the sensor of the image, whose angles surfaces need")
+        if sensor.shape != tuple(image.shape[1:]):
+            raise ValueError(f"sensor has shape {sensor.shape}; it should be {tuple(image.shape[1:])}, as the image")
         measured = image.where(image < sensor.norm_range, 0.0)
         z = self.reduce(self.encoder(describe(measured, sensor, wrap), wrap))
         first = self.block.attention
@@ -117,14 +127,17 @@ class Surfaces(Model):
         return _Encoded(measured, project_pixels(z, position, norm, first.qkv.weight, first.heads), sensor)
 
     def scores(self, encoded: _Encoded, queries: torch.Tensor, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns a score for each hypothesis (B, Q, 4, 9) and a scale for each neighbour (B, Q, 4)."""
+        """Returns a score for each hypothesis (B, Q, 4, 9) and a scale for each neighbour (B, Q, 4).
+
+        `kernels.surfaces` says how the scale becomes the width of a hypothesis.
+        """
         out = self.block.attention.out
         t = neighbour_attention(encoded.projected, queries, (out.weight, out.bias), wrap, backend=self.backend)
         scores, scales = self.head(t + self.block.feed_forward(t)).float().split((KINDS, 1), -1)
         return scores, scales.squeeze(-1)
 
     def decode(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
-        """Answers queries with the weighted median of their hypotheses; `norm_range` of the sensor for no return."""
+        """Returns the weighted medians (B, Q) [m] of the hypotheses; the sensor's `norm_range` means no return."""
         scores, scales = self.scores(encoded, queries, wrap)
         angles = encoded.sensor.angles(image.device)
         ranges, _, _ = surface_median(encoded.measured, queries, *angles, scores, scales, wrap, self.backend)
@@ -138,7 +151,13 @@ class Surfaces(Model):
         wrap: bool = True,
         sensor: Sensor | None = None,
     ) -> torch.Tensor:
-        """Returns the mean of the negative log-likelihood and of the expected absolute error; see `Model.loss`."""
+        """Returns the mean negative log-likelihood plus the weighted mean of the expected absolute error [m].
+
+        Arguments are those of `Model.loss`. No return is filled with the sensor's `norm_range`.
+
+        Raises:
+            ValueError: If the sensor is None, or its shape is not that of the image.
+        """
         encoded = self.encode(image, wrap, sensor)
         scores, scales = self.scores(encoded, queries, wrap)
         far, angles = encoded.sensor.norm_range, encoded.sensor.angles(image.device)

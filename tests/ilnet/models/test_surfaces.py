@@ -63,6 +63,8 @@ def test_the_loss_falls_and_all_parameters_learn():
 
 def test_without_its_sensor_it_says_what_is_missing():
     image, queries = draw()
+    with pytest.raises(ValueError, match=r"sensor has shape \(16, 512\); it should be \(16, 1024\), as the image"):
+        small()(image, queries, sensor=PAPER_INPUT.resize(16, 512))
     with pytest.raises(ValueError, match="sensor is None; it should be the sensor of the image"):
         small()(image, queries)
 
