@@ -1,7 +1,7 @@
 """ILN over surfaces: attention among the neighbours weighs what their surfaces say, and predicts how well they know it.
 
-The paper's network weighs the ranges of the 4 neighbours. This one continues the surfaces that the neighbours lie on, each
-in several ways, and weighs the ranges at which they are met along the query (`kernels.surfaces`).
+The paper's network weighs the ranges of the 4 neighbours. This one continues the surface that each neighbour lies on in
+several ways, and weighs the ranges at which these are met along the query (`kernels.surfaces`).
 """
 
 from typing import NamedTuple
