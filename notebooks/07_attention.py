@@ -772,7 +772,7 @@ def train(depth, seed):
     optimiser = torch.optim.Adam(model.parameters(), lr=1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 1e-3, total_steps=STEPS)
     for batch in batches:
-        image, queries, ranges, wrap = (x.to(device) if isinstance(x, torch.Tensor) else x for x in batch)
+        image, queries, ranges, wrap, _ = batch.to(device)
         loss = (model(image, queries, wrap) - ranges).abs().mean()
         optimiser.zero_grad()
         loss.backward()

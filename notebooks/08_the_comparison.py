@@ -654,7 +654,7 @@ def train(name):
             curve.append((step, found["iou"].mean(), found["mae"].mean()))
             model.train()
         if step < STEPS:
-            batch = data.Batch(*(v.to(device) if isinstance(v, torch.Tensor) else v for v in batches[step]))
+            batch = batches[step].to(device)
             loss = (model(batch.image, batch.queries, wrap=batch.wrap) - batch.ranges).abs().mean()
             optimizer.zero_grad()
             loss.backward()

@@ -42,6 +42,11 @@ class Batch(NamedTuple):
     sensor: Sensor
     """The sensor of the images."""
 
+    def to(self, device: torch.device | str) -> "Batch":
+        """Returns the same batch with its tensors on a device."""
+        moved = {name: getattr(self, name).to(device) for name in ("image", "queries", "ranges")}
+        return self._replace(**moved)
+
 
 class ContinuousRays(IterableDataset):
     """Endless batches of crops and of rays at random directions between their pixels.

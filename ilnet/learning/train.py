@@ -138,8 +138,7 @@ class Training(lightning.LightningModule):
         """Moves the tensors of a batch; Lightning itself refuses a batch that holds a frozen dataclass, the sensor."""
         if not isinstance(batch, data.Batch):
             return super().transfer_batch_to_device(batch, device, dataloader_idx)
-        moved = {name: getattr(batch, name).to(device) for name in ("image", "queries", "ranges")}
-        return batch._replace(**moved)
+        return batch.to(device)
 
     def training_step(self, batch: data.Batch, index: int) -> torch.Tensor:
         """Returns the loss of the model, see `Model.loss`."""

@@ -40,6 +40,13 @@ def test_a_crop_fits_its_sensor_and_has_room_for_queries(streets):
             data.ContinuousRays(streets, sensors, crops=2, columns=columns, queries=5, seed=0)
 
 
+def test_a_batch_moves_as_a_whole(streets):
+    batch = next(iter(rays(streets)))
+    moved = batch.to("meta")
+    assert {tensor.device.type for tensor in moved[:3]} == {"meta"}
+    assert moved[3:] == batch[3:]
+
+
 def test_a_batch_is_what_the_model_takes(streets):
     batch = next(iter(rays(streets)))
     assert batch.image.shape == (6, 16, 64)
