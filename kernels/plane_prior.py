@@ -1,8 +1,8 @@
 """plane_prior: scores of the 4 neighbours that interpolate a world made of planes.
 
-On a plane the inverse range u = 1/r is linear along a column of the range image. Take four pixels a, b, c, d of a
-column, named by their inverse ranges, and a query between b and c, the fraction f of the way from b. The surface
-through a and b and the surface through c and d reach the query at
+On a plane the inverse range u = 1/r is nearly linear along a column of the range image, if its rows lie evenly and
+close together. Take four pixels a, b, c, d of a column, named by their inverse ranges, and a query between b and c, the
+fraction f of the way from b. The surface through a and b and the surface through c and d reach the query at
 
     u₁ = b + (b - a) f,    u₂ = c - (d - c) (1 - f)
 
@@ -63,7 +63,7 @@ def _at_least(x: Any, floor: Any):
 
 @wp.func
 def _within(x: Any, u: Any, v: Any):
-    """X, clamped to lie between u and v; NaN for NaN."""
+    """The value x, clamped to lie between u and v; NaN for NaN."""
     low = wp.min(u, v)
     high = wp.max(u, v)
     return wp.where(x < low, low, wp.where(x > high, high, x))
@@ -197,7 +197,8 @@ def plane_prior(
         backend: "warp", or "torch" for the plain twin in `kernels.reference`.
 
     Returns:
-        (..., Q, 4) logarithms of weights, -inf where the area is 0, and NaN where a neighbour in the same column is.
+        (..., Q, 4) logarithms of weights. They are -inf where the area is 0, and NaN where the query is or a neighbour
+        in the same column.
 
     Raises:
         TypeError: If `image` is not float32 or float64, or `queries` not a floating-point tensor.

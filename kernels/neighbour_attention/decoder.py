@@ -182,7 +182,7 @@ def _fused_decode_kernel(
 
 
 class DecoderWeights(NamedTuple):
-    """Weights of the decoder after the attention of its first step; shapes (out, in) as in `torch.nn`."""
+    """Weights of the decoder behind its attention, on the device of the table; shapes (out, in) as in `torch.nn`."""
 
     output: tuple[torch.Tensor, torch.Tensor]
     """O (C, C) and its bias (C,)."""
@@ -207,6 +207,10 @@ def fused_decode_serves(projected: Projected) -> bool:
     return fits(projected.pixels, torch.float32, len(projected.shift) // 3, projected.heads)
 
 
+def _empty_ranges(pixels: torch.Tensor, queries: torch.Tensor, *_: Any) -> torch.Tensor:
+    return pixels.new_empty(queries.shape[:2])
+
+
 @torch.library.custom_op("kernels::fused_decode", mutates_args=())
 def _fused_decode(
     pixels: torch.Tensor,
@@ -225,7 +229,7 @@ def _fused_decode(
 ) -> torch.Tensor:
     batch, count, _ = queries.shape
     channels = biases.shape[1]
-    blended = pixels.new_empty(batch, count)
+    blended = _empty_ranges(pixels, queries)
     tokens, x, h = pixels.new_empty(3, 4 * _GROUP * _WORKERS, channels)
     share = -(-batch * count // _WORKERS)
     table = fields(pixels, slope, shift, gram, HEADS, eps, wrap, per_image=count, groups=1)
@@ -236,25 +240,7 @@ def _fused_decode(
     return blended
 
 
-@_fused_decode.register_fake
-def _(
-    pixels: torch.Tensor,
-    queries: torch.Tensor,
-    slope: torch.Tensor,
-    shift: torch.Tensor,
-    gram: torch.Tensor,
-    image: torch.Tensor,
-    weights: torch.Tensor,
-    biases: torch.Tensor,
-    prior: int,
-    area_floor: float,
-    added: torch.Tensor,
-    eps: float,
-    wrap: bool,
-) -> torch.Tensor:
-    return pixels.new_empty(queries.shape[0], queries.shape[1])
-
-
+_fused_decode.register_fake(_empty_ranges)
 refuse(_fused_decode, "its image and queries have a batch dimension for that")
 
 

@@ -114,10 +114,7 @@ def _(
     shift: torch.Tensor,
     gram: torch.Tensor,
     weight: torch.Tensor,
-    adj_step: torch.Tensor,
-    heads: int,
-    eps: float,
-    wrap: bool,
+    *_: Any,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     of_inputs = [t.new_empty(t.shape) for t in (pixels, slope, shift, gram, weight)]
     return *of_inputs, weight.new_empty(weight.shape[0])  # type: ignore[return-value]

@@ -121,11 +121,11 @@ def fields(
     """Returns the fields of a `PixelTable` (`kernels.neighbour_attention.maths`) for `kernels.launch.launch`.
 
     Args:
-        pixels: Contiguous, as the other tensors, `heads` and their shapes in `Projected`.
-        slope: See `pixels`.
-        shift: See `pixels`.
-        gram: See `pixels`.
-        heads: See `pixels`.
+        pixels: (B, H, W, 4·C + 16), contiguous, as are the next three. `Projected` says what they hold.
+        slope: (2, 4·C).
+        shift: (3·C,).
+        gram: (2, 2).
+        heads: Number of heads.
         eps: ε of the layer norm.
         wrap: Whether column W-1 meets column 0.
         per_image: Number of queries of each image.

@@ -4,7 +4,15 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from kernels import DecoderWeights, fused_decode, neighbour_attention, plane_prior, project_pixels, reference
+from kernels import (
+    DecoderWeights,
+    fused_decode,
+    gather_neighbours,
+    neighbour_attention,
+    plane_prior,
+    project_pixels,
+    reference,
+)
 from kernels.checks import PRIORS
 from kernels.neighbour_attention.decoder import _fused_decode
 
@@ -88,6 +96,12 @@ def test_a_score_of_minus_infinity_and_an_area_of_zero_shut_a_neighbour_out():
     ranges = fused_decode(projected, image, on_pixels, weights, "bilinear")
     row, column = on_pixels.long().unbind(-1)
     torch.testing.assert_close(ranges, image[torch.arange(2).unsqueeze(1), row, column], rtol=0, atol=METRES)
+    gathered, _ = gather_neighbours(image.unsqueeze(1), queries)
+    for t in range(4):
+        added = torch.full((2, queries.shape[1], 4), -torch.inf)
+        added[..., t] = 0
+        ranges = fused_decode(projected, image, queries, weights, added=added)
+        torch.testing.assert_close(ranges, gathered[..., t, 0], rtol=0, atol=METRES)
 
 
 def test_opcheck_without_gradients():
