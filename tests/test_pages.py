@@ -1,5 +1,6 @@
 """The pages that people read: their links lead somewhere, and their Python runs."""
 
+import csv
 import re
 import tomllib
 from pathlib import Path
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from ilnet import scan_files
+from ilnet.commands import experiment
 from ilnet.scan import Scan
 from ilnet.sensor import preset
 
@@ -31,6 +33,34 @@ def test_every_link_leads_somewhere(page):
             found = page.parent / target if target else page
             assert found.exists(), target
             assert not anchor or anchor in anchors(found), anchor
+
+
+def test_the_layout_names_each_module_once():
+    layout = re.search(r"^## Layout\n+```\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)[1]
+    folders = ["kernels", *(f"ilnet/{room}" for room in ("", "world", "data", "models", "learning"))]
+    modules = [file.name for folder in folders for file in (ROOT / folder).glob("[!_]*.py")]
+    named = re.findall(r"\w+\.py", layout.partition("\nnotebooks/")[0])
+    assert sorted(named) == sorted(modules)
+
+
+SIZES = ("64x1024", "128x2048", "256x4096")
+
+
+@pytest.mark.parametrize(("page", "sizes"), [("README.md", SIZES[1:2]), ("ilnet/results/README.md", SIZES)])
+def test_the_figures_are_those_that_were_measured(page, sizes):
+    """For each size MAE, IoU and floating, then the paper's MAE and IoU."""
+    with open(ROOT / "ilnet" / "results" / "table.csv", newline="") as file:
+        measured = {(row["model"], row["size"]): row for row in csv.DictReader(file)}
+    rows = re.findall(r"^\| `([\w-]+)`[^|]*\|(.*)\|$", (ROOT / page).read_text(), re.MULTILINE)
+    rows = {name: cells.split("|") for name, cells in rows if cells.count("|") == 5 * len(sizes) - 1}
+    assert rows.keys() >= {"bilinear", "planes", "liif", "iln", "iln-prior"}
+    for name, cells in rows.items():
+        for number, size in enumerate(sizes):
+            ours, paper = cells[5 * number : 5 * number + 3], cells[5 * number + 3 : 5 * number + 5]
+            known, theirs = measured.get((name, size)), experiment.PAPER[size].get(name, ())[:2]
+            expected = [float(known[key]) for key in ("mae", "iou", "floating")] if known else []
+            assert [float(cell) for cell in ours if cell.strip()] == pytest.approx(expected, abs=6e-4)
+            assert [float(cell.strip(" *")) for cell in paper if cell.strip()] == list(theirs)
 
 
 @pytest.mark.parametrize("page", ["README.md", "ilnet/world/README.md"])

@@ -261,9 +261,9 @@ def _plan(
 ) -> _Plan:
     """Checks the arguments of `train` and completes them from the preset."""
     if preset_name not in PRESETS:
-        raise ValueError(f"unknown preset {preset_name!r}; known are {', '.join(PRESETS)}")
+        raise ValueError(f"preset_name is {preset_name!r}; it should be one of {', '.join(PRESETS)}")
     if name not in models.TRAINABLE:
-        raise ValueError(f"model {name!r} cannot be trained; these can: {', '.join(models.TRAINABLE)}")
+        raise ValueError(f"name is {name!r}; it should be one of {', '.join(models.TRAINABLE)}, which can be trained")
     size, source = PRESETS[preset_name], PAPER_INPUT.shape
     given, wanted = format_size(source), format_size(target)
     if archive is None and learns_from_images(name, preset_name):

@@ -44,8 +44,8 @@ _MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
     "liif": (LIIF, {}),
     "lidar-sr": (LiDARSR, {}),
     "iln": (ILN, {}),
-    "iln-surfaces": (Surfaces, {}),
     "iln-prior": (ILN, {"prior": "perspective", "snap": 0.02}),
+    "iln-surfaces": (Surfaces, {}),
 }
 NAMES = tuple(_MODELS)
 TRAINABLE = tuple(name for name, (kind, _) in _MODELS.items() if kind not in (Nearest, Bilinear, Planes))
@@ -64,7 +64,7 @@ def create(name: str, **arguments: Any) -> Model:
         ValueError: If there is no such model.
     """
     if name not in _MODELS:
-        raise ValueError(f"unknown model {name!r}; known are {', '.join(NAMES)}")
+        raise ValueError(f"name is {name!r}; it should be one of {', '.join(NAMES)}")
     kind, defaults = _MODELS[name]
     return kind(**{**defaults, **arguments})
 
@@ -112,7 +112,7 @@ def load(name: str | Path) -> Model:
         raise FileNotFoundError(f"no weights ship for {name}; train them: `python -m ilnet train {name}`")
     if path.suffix not in (".safetensors", ".pth"):
         raise ValueError(
-            f"unknown model {str(name)!r}; known are {', '.join(NAMES)}, a .safetensors file, "
+            f"name is {str(name)!r}; it should be one of {', '.join(NAMES)}, a .safetensors file, "
             "or a .pth checkpoint of the paper's authors"
         )
     if not path.is_file():

@@ -77,7 +77,7 @@ def read(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.Tensor]]:
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise ValueError(f"{path}: not a checkpoint of the authors' code, which holds model and lidar_in") from error
     if theirs not in _MODELS:
-        raise ValueError(f"{path}: its model is {theirs!r}; known are {', '.join(_MODELS)}")
+        raise ValueError(f"{path}: its model is {theirs!r}; it should be one of {', '.join(_MODELS)}")
     name, known = _MODELS[theirs]
     arguments: dict[str, Any] = {"norm_range": norm_range}
     if unknown := set(given) - set(known):

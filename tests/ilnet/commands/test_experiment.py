@@ -1,6 +1,8 @@
 import csv
 import math
+import shutil
 import types
+from pathlib import Path
 
 import pytest
 import torch
@@ -209,3 +211,11 @@ def test_networks_go_where_the_scans_are(tmp_path, monkeypatch):
     model.to_empty(device="cpu")
     experiment._draw_points(experiment.Study(None, tmp_path), (64, 1024), {"iln": "iln"})
     assert set(seen) == {("meta", "meta")}
+
+
+def test_the_page_that_ships_is_the_one_that_its_numbers_make(tmp_path):
+    shipped = Path(experiment.__file__).parents[1] / "results"
+    for file in (shipped / "about.json", *shipped.glob("*.csv")):
+        shutil.copy(file, tmp_path)
+    page = experiment.results(experiment.Study(None, tmp_path))
+    assert page.read_text() == (shipped / "RESULTS.md").read_text()

@@ -104,7 +104,7 @@ def test_of_two_files_with_one_name_the_first_is_kept(run, tmp_path):
         (("in.npz", "out.npz"), "--size ROWSxCOLUMNS or --sensor NAME"),
         (("in.npz", "out.npz", "--size", "16x256", "--sensor", "vlp-16"), "--size ROWSxCOLUMNS or --sensor NAME"),
         (("in.npz", "out.npz", "--sensor", "vlp-61"), "sensor is 'vlp-61'; it should be one of"),
-        (("in.npz", "out.npz", "--size", "16x256", "--model", "ilm"), "unknown model 'ilm'"),
+        (("in.npz", "out.npz", "--size", "16x256", "--model", "ilm"), "name is 'ilm'; it should be one of"),
         (("in.npz", "out.npz", "--size", "16x256", "--format", "ply"), "--format goes with a folder"),
         (("in.npz", "out.xyz", "--size", "16x256"), "its suffix is '.xyz'"),
         (("in.npz", "in.npz", "--size", "16x256"), "out is in.npz, the file to be read"),

@@ -271,7 +271,7 @@ def test_a_checkpoint_that_holds_a_program_is_refused_and_not_run(tmp_path):
 
 ARGUMENTS = {"d": 1, "h": 8}
 BAD = {
-    "another model": (("tulip", ARGUMENTS), "its model is 'tulip'; known are iln, liif_lidar, lsr"),
+    "another model": (("tulip", ARGUMENTS), "its model is 'tulip'; it should be one of iln, liif_lidar, lsr"),
     "another argument": (("iln", {**ARGUMENTS, "windows": 3}), "unknown here: windows"),
     "another variant": (("liif_lidar", {"feat_unfold": True}), "feat_unfold = True; only False"),
     "another depth": (

@@ -613,9 +613,9 @@ def test_compiles_without_graph_breaks():
 
 
 def test_bad_weights_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="unknown model 'ilm'"):
+    with pytest.raises(ValueError, match="name is 'ilm'; it should be one of nearest"):
         models.load("ilm")
-    with pytest.raises(ValueError, match="unknown model 'ilm'"):
+    with pytest.raises(ValueError, match="name is 'ilm'; it should be one of nearest"):
         models.create("ilm")
     with pytest.raises(FileNotFoundError, match="no weights ship for lidar-sr; train them"):
         models.load("lidar-sr")
