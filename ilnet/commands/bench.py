@@ -264,7 +264,6 @@ def frame() -> Iterator[Row]:
     torch.manual_seed(0)
     model = models.ILN().eval().to(device)
     scan, _ = demo.from_town()
-    scan = scan.to(device)
     source, target = scan.sensor, PAPER_TARGET
     for precision in models.PRECISIONS:
         for wanted in (target, target.resize(*LARGE)):

@@ -28,13 +28,13 @@ class Model(nn.Module):
     The networks were trained with the lowest beam in row 0 and with rising azimuths. `ranges` and `upsample` flip scans
     that are stored in another order.
 
-    A subclass defines `decode`; `encode`, if it extracts features; and `check_sensors`, if it cannot predict every
-    sensor.
+    A subclass defines `decode`. It defines `encode` if it extracts features, `check_sensors` if it cannot predict every
+    sensor, and `loss` if it learns from another one.
     """
 
     norm_range = 0.0
-    """The range [m] that the network sees as +1, and the least that no return is filled with; 0 for models without
-    a network."""
+    """The range [m] that the network sees as +1, and the least that no return is filled with. 0 means that no return is
+    filled with the sensor's own."""
 
     backend = "warp"
     """The backend of the ops: "warp", or "torch" for their plain twins (`kernels.reference`)."""
@@ -103,6 +103,12 @@ class Model(nn.Module):
             ranges: (B, Q) metres that a laser would measure along the queries, no return filled.
             wrap: As in `forward`.
             sensor: As in `forward`.
+
+        Returns:
+            The mean over all queries, a scalar.
+
+        Raises:
+            ValueError: As in `forward`.
         """
         predicted = self(image, queries, wrap=wrap, sensor=sensor)
         return (predicted - ranges).abs().mean() * (2 / self.norm_range)

@@ -11,7 +11,7 @@ __all__ = ["Bilinear", "Nearest", "Planes", "interpolate_planes"]
 class Nearest(Model):
     """The range of the pixel nearest to the query."""
 
-    def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+    def decode(self, encoded: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Returns the ranges (B, Q) [m] of queries (B, Q, 2)."""
         # For a query on a pixel centre, only that pixel has an area above 0.
         scores = queries.new_zeros(*queries.shape[:-1], 4)
@@ -29,7 +29,7 @@ class Bilinear(Model):
         super().__init__()
         self.prior = "perspective" if inverse else "bilinear"
 
-    def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+    def decode(self, encoded: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Returns the ranges (B, Q) [m] of queries (B, Q, 2)."""
         scores = queries.new_zeros(*queries.shape[:-1], 4)
         return gather_blend(image, queries, scores, self.prior, wrap, backend=self.backend)
@@ -45,6 +45,6 @@ def interpolate_planes(image: torch.Tensor, queries: torch.Tensor, wrap: bool, b
 class Planes(Model):
     """The planes around a query, continued to their crease or edge; see `kernels.plane_prior`."""
 
-    def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+    def decode(self, encoded: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Returns the ranges (B, Q) [m] of queries (B, Q, 2)."""
         return interpolate_planes(image, queries, wrap, self.backend)

@@ -41,9 +41,9 @@ ARCHIVE_JITTER = Jitter(0.1, math.radians(1.0))
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A mesh to cast rays at, waypoints for a sensor to stand over, and the traffic of a town where it is one.
+    """A mesh to cast rays at, and waypoints for a sensor to stand over; in a town, its traffic too.
 
-    The ray casting mesh is made when it is first needed, and again in a process that a place is sent to.
+    The mesh of the rays is made when it is first needed, and again in a process that a place is sent to.
 
     Args:
         vertices: (V, 3) floating-point [m], z up.
@@ -143,10 +143,15 @@ def mesh(
 
 
 def held_out_scans(place: Place, count: int, sensors: Sequence[Sensor]) -> list[list[Scan]]:
-    """Simulates evenly spread waypoints of a place, each in its own traffic, with each of several sensors.
+    """Scans evenly spread waypoints of a place, each in its own traffic, with each of several sensors.
+
+    Args:
+        place: Where the scans are taken.
+        count: Number of waypoints.
+        sensors: The sensors; all stand at the same pose.
 
     Returns:
-        For each waypoint one scan per sensor.
+        For each waypoint one scan per sensor, on the device of the place.
     """
     scans = []
     for number in place.spread(count):

@@ -63,8 +63,8 @@ def hits(mesh: Mesh, pose: torch.Tensor, directions: torch.Tensor, max_range: fl
 
     Args:
         mesh: What they may meet, in metres.
-        pose: (..., 4, 4) transforms from the sensor frame to that of the mesh.
-        directions: (..., N, 3) unit vectors in the sensor frame.
+        pose: (..., 4, 4) transforms from the sensor frame to that of the mesh, on any device.
+        directions: (..., N, 3) unit vectors in the sensor frame, on any device.
         max_range: Greatest range that is found [m].
 
     Returns:
@@ -76,7 +76,7 @@ def hits(mesh: Mesh, pose: torch.Tensor, directions: torch.Tensor, max_range: fl
 
 
 def nearest(found: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Returns the nearest of several ranges [m] of the same rays, 0 where all are 0."""
+    """Returns the nearest (...) of several ranges (...) [m] of the same rays, 0 where all are 0."""
     ranges, *others = found
     for other in others:
         ranges = other.where(nearer(other, ranges), ranges)
@@ -94,9 +94,9 @@ def ranges(world: World, sensor: Sensor, poses: torch.Tensor) -> torch.Tensor:
     """Casts every ray of a sensor at each of several poses, with the engine that is faster for each mesh.
 
     Args:
-        world: Meshes in metres; the nearest hit counts.
+        world: Meshes in metres, all on one device; the nearest hit counts.
         sensor: The sensor whose rays are cast.
-        poses: (..., 4, 4) transforms from the sensor frame to the world.
+        poses: (..., 4, 4) transforms from the sensor frame to the world, on any device.
 
     Returns:
         (..., H, W) float32 ranges [m] on the meshes' device; 0 where nothing is met between the sensor's minimum and
@@ -126,9 +126,10 @@ def scan(world: World, sensor: Sensor, pose: torch.Tensor, effects: Effects | No
     """Simulates one scan: casts every ray of a sensor.
 
     Args:
-        world: Meshes in metres; the nearest hit counts.
+        world: Meshes in metres, all on one device; the nearest hit counts.
         sensor: The sensor whose rays are cast.
-        pose: (4, 4) transform from the sensor frame to the world; in the middle of the turn where the sensor moves.
+        pose: (4, 4) transform from the sensor frame to the world, on any device; where the sensor moves, that in the
+            middle of the turn.
         effects: What a real sensor does to its measurements; None for perfect ranges.
         seed: Seed of the effects' random numbers.
 
