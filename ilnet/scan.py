@@ -133,7 +133,15 @@ Pair = tuple[Scan, Scan]
 
 
 def real_tensor(name: str, value: object) -> torch.Tensor:
-    """Returns an array of integers or floats as a tensor; `name` is for errors."""
+    """Returns an array or tensor of integers or floats as a tensor.
+
+    Args:
+        name: What it is called in errors.
+        value: The array; a tensor keeps its device and dtype.
+
+    Raises:
+        ValueError: If it holds anything else.
+    """
     if isinstance(value, torch.Tensor):
         if value.is_complex() or value.dtype == torch.bool:
             raise ValueError(f"{name} is of dtype {value.dtype}; it should hold real numbers")

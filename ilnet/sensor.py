@@ -125,6 +125,10 @@ class Sensor:
         elevations, azimuths = (tuple(table.round(9).tolist()) for table in (self.elevations, self.azimuths))
         return elevations, azimuths, self.min_range, self.max_range, self.norm_range
 
+    def __getstate__(self) -> dict[str, object]:
+        # Tensors on a GPU stay in the process that made them.
+        return {**self.__dict__, "_tensors": {}}
+
     def __repr__(self) -> str:
         e, a = np.rad2deg(self.elevations), np.rad2deg(self.azimuths)
         return (
@@ -256,6 +260,9 @@ class Sensor:
         """Returns a sensor of `rows` x `columns` evenly spaced rays over the same field of view, without a name.
 
         The outermost beams stay. A full circle keeps its first column; a partial one its first and last.
+
+        Raises:
+            ValueError: If `rows` or `columns` is below 2.
         """
         if rows < 2 or columns < 2:
             raise ValueError(f"rows and columns are {rows} and {columns}; each should be at least 2")

@@ -332,7 +332,7 @@ def _draw_batches(model: models.ILN, optimizer: torch.optim.Optimizer, device: t
     rays = data.ContinuousRays([place], PAPER_INPUT, size.crops, size.columns, size.queries, seed=0)
     batches = iter(rays)
     batch = next(batches)
-    image, queries, truth = (tensor.to(device) for tensor in (batch.image, batch.queries, batch.ranges))
+    image, queries, truth, *_ = batch.to(device)
 
     nothing = [torch.zeros(1)]  # there is no common result to compare
 

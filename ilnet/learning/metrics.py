@@ -1,4 +1,4 @@
-"""Figures of a predicted range image: metres off, occupied voxels (paper, Sec. III-B), and points at edges."""
+"""How good a predicted range image is: errors in metres, occupied voxels (paper, Sec. III-B), points at edges."""
 
 from collections.abc import Callable, Iterator
 

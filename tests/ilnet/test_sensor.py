@@ -439,3 +439,6 @@ def test_angles_are_made_once_and_serve_training_after_inference():
     (scale * elevations).sum().backward()
     assert scale.grad.item() == pytest.approx(sensor.elevations.sum(), abs=1e-5)
     assert {table.device.type for table in sensor.angles("meta")} == {"meta"}
+    sent = pickle.loads(pickle.dumps(sensor))  # its tensors stay behind: there may be no such device
+    assert sent == sensor
+    assert sent._tensors == {}
