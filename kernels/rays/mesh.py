@@ -128,10 +128,17 @@ class Mesh:
         self._lock = threading.Lock()
         self._tree: wp.Mesh | None = None
         self._clusters: Clusters | None = None
+        self._wait()
 
     def __del__(self) -> None:
-        # Warp frees a tree at once, though rays may still be on their way through it.
-        if getattr(self, "_tree", None) is not None and self.device.type == "cuda":
+        # Warp frees a tree at once, and torch gives clusters to the stream that made them, though rays may still be on
+        # their way through either.
+        if getattr(self, "_tree", None) is not None or getattr(self, "_clusters", None) is not None:
+            self._wait()
+
+    def _wait(self) -> None:
+        # What the mesh keeps is made on one stream and used on any other, Warp's included.
+        if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
 
     def _get_tree(self) -> wp.Mesh:
@@ -148,15 +155,15 @@ class Mesh:
         if self.device.type != "cuda":
             return wp.Mesh(points, indices, bvh_constructor=constructor)
         with torch.cuda.device(self.device):  # Warp leaves another device as the current one
-            torch.cuda.synchronize(self.device)  # the copies ran on torch's stream, and the tree is built on Warp's
             tree = wp.Mesh(points, indices, bvh_constructor=constructor)
-            wp.synchronize_device(str(self.device))  # the rays run on torch's stream again
+        self._wait()
         return tree
 
     def _get_clusters(self) -> Clusters:
         with self._lock:
             if self._clusters is None:
                 self._clusters = cluster_triangles(self._vertices, self._triangles)
+                self._wait()
             return self._clusters
 
     def cast(self, origins: torch.Tensor, directions: torch.Tensor, max_range: float, backend: str = "warp") -> Hits:

@@ -178,6 +178,24 @@ def test_a_mesh_may_go_before_its_rays_have_come_home(device):
         assert torch.equal(dropped, expected)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_a_mesh_made_on_one_stream_serves_another():
+    origin, down = torch.tensor([0.0, 0.0, 2.0], device="cuda"), torch.tensor([0.0, 0.0, -1.0], device="cuda")
+    pose = torch.eye(4)
+    pose[2, 3] = 2.0
+    made, used = torch.cuda.Stream(), torch.cuda.Stream()
+    for engine in ("tree", "clusters"):
+        torch.cuda.synchronize()
+        with torch.cuda.stream(made):
+            torch.cuda._sleep(500_000_000)  # a few tenths of a second
+            mesh = Mesh(*plane(), "cuda")
+        with torch.cuda.stream(used):
+            if engine == "tree":
+                assert mesh.cast(origin, down, 5.0).range == 2
+            else:
+                assert mesh.project(pose, torch.tensor([-1.5]), torch.zeros(1), 5.0) > 2
+
+
 def test_a_range_may_be_any_real_number(device):
     mesh = Mesh(*plane(), device)
     down = torch.tensor([0.0, 0.0, -1.0], device=device)
