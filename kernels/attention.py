@@ -126,7 +126,7 @@ def _empty_attended(qkv: torch.Tensor) -> torch.Tensor:
 
 
 @torch.library.custom_op("kernels::attend_neighbours", mutates_args=())
-def _attend_neighbours_op(qkv: torch.Tensor) -> torch.Tensor:
+def _attend_neighbours(qkv: torch.Tensor) -> torch.Tensor:
     count, _, heads, width = qkv.shape
     attended = _empty_attended(qkv)
     launch(_attend[qkv.dtype], count * heads, [qkv, 1 / math.sqrt(width)], [attended])
@@ -138,15 +138,15 @@ def _empty_adj_qkv(qkv: torch.Tensor, adj_attended: torch.Tensor) -> torch.Tenso
 
 
 @torch.library.custom_op("kernels::attend_neighbours_backward", mutates_args=())
-def _attend_neighbours_backward_op(qkv: torch.Tensor, adj_attended: torch.Tensor) -> torch.Tensor:
+def _attend_neighbours_backward(qkv: torch.Tensor, adj_attended: torch.Tensor) -> torch.Tensor:
     count, _, heads, width = qkv.shape
     adj_qkv = _empty_adj_qkv(qkv, adj_attended)
     launch(_attend_backward[qkv.dtype], count * heads, [qkv, adj_attended, 1 / math.sqrt(width)], [adj_qkv])
     return adj_qkv
 
 
-_attend_neighbours_op.register_fake(_empty_attended)
-_attend_neighbours_backward_op.register_fake(_empty_adj_qkv)
+_attend_neighbours.register_fake(_empty_attended)
+_attend_neighbours_backward.register_fake(_empty_adj_qkv)
 
 
 def _setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
@@ -155,12 +155,12 @@ def _setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
 
 def _backward(ctx: Any, adj_attended: torch.Tensor) -> torch.Tensor:
     (qkv,) = ctx.saved_tensors
-    return _attend_neighbours_backward_op(qkv, adj_attended)
+    return _attend_neighbours_backward(qkv, adj_attended)
 
 
-_attend_neighbours_op.register_autograd(_backward, setup_context=_setup_context)
-fold_into_batch(_attend_neighbours_op)
-fold_into_batch(_attend_neighbours_backward_op)
+_attend_neighbours.register_autograd(_backward, setup_context=_setup_context)
+fold_into_batch(_attend_neighbours)
+fold_into_batch(_attend_neighbours_backward)
 
 
 def attend_neighbours(qkv: torch.Tensor, heads: int, backend: str = "warp") -> torch.Tensor:
@@ -193,5 +193,5 @@ def attend_neighbours(qkv: torch.Tensor, heads: int, backend: str = "warp") -> t
         )
     batch, width = qkv.shape[:-2], qkv.shape[-1] // (3 * heads)
     qkv = qkv.reshape(-1, 12, heads, width)
-    attended = reference.attend_neighbours(qkv) if backend == "torch" else _attend_neighbours_op(qkv.contiguous())
+    attended = reference.attend_neighbours(qkv) if backend == "torch" else _attend_neighbours(qkv.contiguous())
     return attended.reshape(*batch, 4, heads * width)

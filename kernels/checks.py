@@ -46,24 +46,25 @@ PARTED = 0.03
 # From this sharpness on, a step jumps from 0 to 1 without values between.
 SHARPEST = 1e3
 
-# Hypotheses of a neighbour in `kernels.surfaces`: outer, inner or no continuation along its column, and along its row.
+# The constants down to `TOLERANCE` are those of `kernels.surfaces`. A neighbour has 9 hypotheses: its surface is
+# continued along its column with the outer pixel, with the inner one or not at all, and along its row likewise.
 KINDS = 9
 # Least bilinear area in their prior, so that a neighbour can be right where its area is 0.
 AREA_FLOOR = 1e-3
-# Chance that no hypothesis explains a measured range, and the same for a no return.
+# Probability that a measured range is explained by no hypothesis, and the same for a no return (ε).
 BACKGROUND = 1e-3
-# A surface comes nearer or goes farther by this factor at most.
+# The continued range differs from the measured one by this factor at most.
 CONTINUED = 4.0
-# Metres. Measured ranges below are taken as this.
+# Metres. A measured range below this is taken as this.
 LEAST_RANGE = 0.01
-# Metres, of the width of a hypothesis.
+# Metres. Least scale of a hypothesis (b).
 LEAST_SCALE = 0.02
 # Radians. No surface is continued over a wider gap.
 WIDEST_GAP = 0.5
-# Pixels. The attention step takes a coordinate farther out as this far, so that squares of offsets stay finite.
-FARTHEST = 2.0**30
 # Metres within which a range counts as right in a confidence.
 TOLERANCE = 0.1
+# Pixels. The attention step takes a coordinate farther out as this far, so that squares of offsets stay finite.
+FARTHEST = 2.0**30
 
 
 def check_floating(name: str, tensor: object, dtypes: Iterable[torch.dtype], shape: str) -> None:

@@ -202,7 +202,10 @@ def _scale(c: Any):
 
 @wp.func
 def _explain(found: Any, scales: Any, target: Any, far: Any):
-    """What each hypothesis says of a measured range: its density or probability, and the error; Eq. (4)."""
+    """What each hypothesis says of a measured range by Eq. (4), and the absolute error.
+
+    What it says is a density, or a probability where nothing returned.
+    """
     zero = type(target)(0.0)
     gap = found
     p = found
@@ -224,7 +227,7 @@ def _explain(found: Any, scales: Any, target: Any, far: Any):
 
 @wp.func
 def _mass(x: Any):
-    """The Laplace distribution function."""
+    """The distribution function of the Laplace distribution of scale 1."""
     half = type(x)(0.5) * wp.exp(-wp.abs(x))
     return wp.where(x < type(x)(0.0), half, type(x)(1.0) - half)
 
@@ -270,12 +273,12 @@ def _settle(found: Any, w: Any, scales: Any):
 
 
 def _kernels(scalar: type) -> tuple[wp.Kernel, ...]:
-    """The kernels that compute with float32 or float64; a struct holds arrays of one of them."""
+    """Returns the four kernels for float32 or float64. They are made for each, since no struct's arrays are generic."""
     many, four = wp.types.vector(4 * KINDS, scalar), wp.types.vector(4, scalar)
 
     @wp.struct
     class Rays:
-        """What was measured, and what is asked."""
+        """What was measured, and the rays that are asked for."""
 
         image: wp.array3d[scalar]
         """(B, H, W) metres, 0 where nothing returned."""
@@ -418,7 +421,7 @@ _found, _likelihood, _likelihood_backward, _median = (
 def _rays(
     image: torch.Tensor, queries: torch.Tensor, elevations: torch.Tensor, azimuths: torch.Tensor, wrap: bool
 ) -> dict[str, Any]:
-    """The fields of `Rays`, for `launch`."""
+    """Returns the fields of `Rays` for `kernels.launch.launch`."""
     tensors = {"image": image, "elevations": elevations, "azimuths": azimuths, "queries": queries}
     return {**tensors, "wrap": int(wrap)}
 
@@ -684,7 +687,12 @@ def surface_median(
 def _checked(
     image: torch.Tensor, queries: torch.Tensor, elevations: torch.Tensor, azimuths: torch.Tensor, backend: str
 ) -> tuple[torch.Size, torch.Tensor, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
-    """Checks what all these ops take, and folds leading dimensions into one."""
+    """Checks what all these ops take.
+
+    Returns:
+        The broadcast batch shape, the image (B, H, W), the queries (B, Q, 2), and the tables: elevations (H,) and
+        azimuths (W,). All are contiguous, of the image's dtype and without gradients.
+    """
     check_backend(backend)
     check_floating("image", image, list(_found), "(..., H, W)")
     if image.ndim < 2 or 0 in image.shape[-2:]:
@@ -708,7 +716,7 @@ def _checked(
 def _of_queries(
     name: str, tensor: torch.Tensor, batch: torch.Size, shape: tuple[int, ...], image: torch.Tensor
 ) -> torch.Tensor:
-    """Checks what each query has one of, and folds its leading dimensions into one."""
+    """Checks a tensor (*batch, *shape) of something for each query; returns it as (B, *shape) of the image's dtype."""
     dtypes = [torch.float32, torch.float64, torch.bfloat16, torch.float16]
     check_floating(name, tensor, dtypes, str((*batch, *shape)))
     if tensor.shape != (*batch, *shape):

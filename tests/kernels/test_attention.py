@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from kernels import attend_neighbours
-from kernels.attention import _attend_neighbours_op
+from kernels.attention import _attend_neighbours
 
 # Half precision is rounded once on the way out by the kernel, several times on the way by plain PyTorch.
 TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12, torch.bfloat16: 6e-2, torch.float16: 8e-3}
@@ -39,7 +39,7 @@ def test_gradcheck(device):
 
 
 def test_opcheck(device):
-    torch.library.opcheck(_attend_neighbours_op, (draw(device, batch=(6,)).view(6, 12, 2, 5).requires_grad_(),))
+    torch.library.opcheck(_attend_neighbours, (draw(device, batch=(6,)).view(6, 12, 2, 5).requires_grad_(),))
 
 
 def test_compiles_without_graph_breaks(device):
