@@ -241,10 +241,16 @@ def _parallel(function: Callable[[int], T], numbers: list[int], workers: int) ->
         return
     pipe = os.pipe()
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _begin, (function, *pipe))
+    processes: list[multiprocessing.process.BaseProcess] = []
     try:
-        for future in as_completed([pool.submit(_call, number) for number in numbers]):
+        futures = [pool.submit(_call, number) for number in numbers]
+        processes = multiprocessing.active_children()
+        for future in as_completed(futures):
             yield future.result()
     except BrokenProcessPool:
+        # Ctrl-C ends the workers, and it may reach this process where Python can raise nothing.
+        if any(process.exitcode == -signal.SIGINT for process in processes):
+            raise KeyboardInterrupt from None
         raise ChildProcessError(
             "a worker died, perhaps for lack of memory; what is complete is kept: run the same again, with fewer "
             "workers"

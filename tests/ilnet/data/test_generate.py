@@ -197,6 +197,21 @@ def test_a_worker_that_dies_is_reported(tmp_path, undisturbed, monkeypatch):
     assert files(make(tmp_path / "x").path) == files(undisturbed.path)
 
 
+@on_cpu
+def test_a_worker_that_ctrl_c_ends_interrupts_the_whole(tmp_path, undisturbed, monkeypatch):
+    """Ctrl-C reaches all processes, and this one may miss it."""
+    parent, images = os.getpid(), generate._Plan.images
+
+    def interrupted(plan, scan):
+        if os.getpid() != parent and scan == 2 * UNIT:
+            os.kill(os.getpid(), signal.SIGINT)
+        return images(plan, scan)
+
+    monkeypatch.setattr(generate._Plan, "images", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "x", workers=2)
+
+
 @pytest.fixture
 def mesh_file(tmp_path):
     vertices, triangles = yard_triangles()
@@ -231,7 +246,7 @@ def test_killed_three_times_it_ends_as_if_undisturbed(tmp_path, mesh_file):
         stop(run)
         # Ends when the last process that could write to the pipe has: no worker outlives its parent.
         _, said = run.communicate(timeout=60)
-    assert run.returncode == 130
+    assert run.returncode == 130, said
     assert said.splitlines()[-2].startswith("interrupted: finished units stay in")
     assert "Traceback" not in said
     assert 0 < len(open_archive(out).missing()) < units
