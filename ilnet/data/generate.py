@@ -242,24 +242,28 @@ def _parallel(function: Callable[[int], T], numbers: list[int], workers: int) ->
     pipe = os.pipe()
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _begin, (function, *pipe))
     processes: list[multiprocessing.process.BaseProcess] = []
+    broken = False
     try:
         futures = [pool.submit(_call, number) for number in numbers]
         processes = multiprocessing.active_children()
         for future in as_completed(futures):
             yield future.result()
     except BrokenProcessPool:
-        # Ctrl-C ends the workers, and it may reach this process where Python can raise nothing.
-        if any(process.exitcode == -signal.SIGINT for process in processes):
-            raise KeyboardInterrupt from None
-        raise ChildProcessError(
-            "a worker died, perhaps for lack of memory; what is complete is kept: run the same again, with fewer "
-            "workers"
-        ) from None
+        broken = True
     finally:
         # Busy workers end at once; a file that they have not finished does not count.
         os.close(pipe[1])
         pool.shutdown(cancel_futures=True)
         os.close(pipe[0])
+    if broken:
+        # Ctrl-C ends the workers, and it may reach this process where Python can raise nothing. How they ended is known
+        # once the pool has been shut down.
+        if any(process.exitcode == -signal.SIGINT for process in processes):
+            raise KeyboardInterrupt
+        raise ChildProcessError(
+            "a worker died, perhaps for lack of memory; what is complete is kept: run the same again, with fewer "
+            "workers"
+        )
 
 
 # Inherited by a worker, since it cannot be sent.
