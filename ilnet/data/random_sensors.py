@@ -45,7 +45,7 @@ def draw_sensor(rng: np.random.Generator) -> Sensor:
     elevations = top - view + np.concatenate(([0.0], np.cumsum(steps)))
     azimuths = np.linspace(-math.pi, math.pi, int(rng.choice(COLUMNS)), endpoint=False)
     nearest = float(rng.choice([0.3, 0.5, 1.0, 2.0]))
-    farthest = math.exp(rng.uniform(math.log(60), math.log(180)))
+    farthest = math.exp(rng.uniform(math.log(50), math.log(130)))
     return Sensor(np.deg2rad(elevations), azimuths, nearest, farthest, 1.25 * farthest, name="any")
 
 
@@ -76,7 +76,7 @@ def draw_effects(rng: np.random.Generator) -> Effects:
     return Effects(
         range_noise=noisy * rng.uniform(0, 0.03),
         range_noise_growth=noisy * rng.uniform(0, 0.0005),
-        dropout=lossy * rng.uniform(0, 0.08),
+        dropout=lossy * 0.25 * rng.random() ** 2,
         dropout_range=lossy * rng.uniform(0, 0.4),
         dropout_incidence=lossy * rng.uniform(0, 0.6),
     )

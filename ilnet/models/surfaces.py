@@ -95,7 +95,7 @@ class Surfaces(Model):
     Source: ours; `kernels.surfaces` has the equations.
     """
 
-    def __init__(self, features: int = 64, blocks: int = 8, tokens: int = 32, heads: int = 8, weight: float = 1.0):
+    def __init__(self, features: int = 48, blocks: int = 8, tokens: int = 32, heads: int = 8, weight: float = 1.0):
         if heads < 1 or tokens % heads:
             raise ValueError(f"heads is {heads}; it should divide the {tokens} tokens")
         super().__init__()
