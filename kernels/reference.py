@@ -315,12 +315,13 @@ def surface_median(
     r, order = found.where(found > 0, math.inf).flatten(-2).sort(-1)
     below = w.flatten(-2).gather(-1, order).cumsum(-1)
     median = r.gather(-1, (below < 0.5).sum(-1, keepdim=True).clamp(max=r.shape[-1] - 1)).unsqueeze(-1)
-    whole, none = w.flatten(-2).sum(-1), (w * (found == 0)).flatten(-2).sum(-1)
     b = (0.5 * F.softplus(scales) + LEAST_SCALE).unsqueeze(-1)
     ends = [(median - found + side).where(median.isfinite(), 0.0) / b for side in (-TOLERANCE, TOLERANCE)]
     low, high = (torch.where(x < 0, 0.5 * x.clamp(max=0).exp(), 1 - 0.5 * (-x).clamp(max=0).exp()) for x in ends)
-    near = (w * (high - low)).where(found > 0, 0.0).flatten(-2).sum(-1)
+    near = torch.where(median.isfinite(), (high - low).where(found > 0, 0.0), (found == 0).to(w))
     median = median.flatten(-3)
-    confidence = near.where(median.isfinite(), none)
-    ranges = median.where(median.isfinite(), 0.0).where(~whole.isnan(), math.nan)
-    return ranges, (1 - 2 * BACKGROUND) * confidence, (1 - 2 * BACKGROUND) * none
+    unknown = w.flatten(-2).sum(-1).isnan()
+    ranges = median.where(median.isfinite(), 0.0).masked_fill(unknown, math.nan)
+    support = (w * near).sum(-1).masked_fill(unknown.unsqueeze(-1), math.nan)
+    none = (w * (found == 0)).flatten(-2).sum(-1)
+    return ranges, (1 - 2 * BACKGROUND) * support, (1 - 2 * BACKGROUND) * none

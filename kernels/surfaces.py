@@ -234,7 +234,7 @@ def _mass(x: Any):
 
 @wp.func
 def _settle(found: Any, w: Any, scales: Any):
-    """The weighted median of hypotheses, the probability that it is right, and that of no return.
+    """The weighted median of hypotheses, the probability that each neighbour's surface is met there, that of no return.
 
     The median is 0 for no return and NaN where a weight is NaN.
     """
@@ -255,21 +255,24 @@ def _settle(found: Any, w: Any, scales: Any):
     median = infinite
     for k in range(len(found)):
         median = wp.min(median, wp.where(below[k] >= type(zero)(0.5) * whole, r[k], infinite))
-    trusted = none
-    if median < infinite:
-        trusted = zero
-        for t in range(4):
-            inverse = type(zero)(1.0) / _scale(scales[t])
-            for k in range(9):
-                x = r[9 * t + k]
+    known = (type(zero)(1.0) - type(zero)(2.0) * type(zero)(_BACKGROUND)) / whole
+    support = scales
+    for t in range(4):
+        inverse = type(zero)(1.0) / _scale(scales[t])
+        met = zero
+        for k in range(9):
+            x = r[9 * t + k]
+            near = wp.where(x < infinite, zero, type(zero)(1.0))
+            if median < infinite:
+                near = zero
                 if x < infinite:
                     near = _mass((median - x + type(zero)(_TOLERANCE)) * inverse)
                     near = near - _mass((median - x - type(zero)(_TOLERANCE)) * inverse)
-                    trusted = trusted + w[9 * t + k] * near
-    else:
+            met = met + w[9 * t + k] * near
+        support[t] = met * known
+    if median == infinite:
         median = wp.where(whole >= zero, zero, whole)  # NaN for NaN
-    known = (type(zero)(1.0) - type(zero)(2.0) * type(zero)(_BACKGROUND)) / whole
-    return median, trusted * known, none * known
+    return median, support, none * known
 
 
 def _kernels(scalar: type) -> tuple[wp.Kernel, ...]:
@@ -395,7 +398,7 @@ def _kernels(scalar: type) -> tuple[wp.Kernel, ...]:
         scales: wp.array2d[four],
         # out
         ranges_out: wp.array2d[scalar],
-        confidence_out: wp.array2d[scalar],
+        support_out: wp.array2d[four],
         none_out: wp.array2d[scalar],
     ):
         b, q = query_of(first + wp.tid(), rays.queries.shape[1])
@@ -403,9 +406,9 @@ def _kernels(scalar: type) -> tuple[wp.Kernel, ...]:
         column = rays.queries[b, q, 1]
         w = _weigh(scores[b, q], row, column)
         found = _hypotheses(rays, b, row, column, scores.dtype())
-        median, confidence, none = _settle(found, w, scales[b, q])
+        median, support, none = _settle(found, w, scales[b, q])
         ranges_out[b, q] = median
-        confidence_out[b, q] = confidence
+        support_out[b, q] = support
         none_out[b, q] = none
 
     return _hypotheses_kernel, _likelihood_kernel, _likelihood_backward_kernel, _median_kernel
@@ -524,7 +527,7 @@ def _empty_answers(
     image: torch.Tensor, queries: torch.Tensor, *_: Any
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     shape = queries.shape[:2]
-    return image.new_empty(shape), image.new_empty(shape), image.new_empty(shape)
+    return image.new_empty(shape), image.new_empty(*shape, 4), image.new_empty(shape)
 
 
 @torch.library.custom_op("kernels::surface_median", mutates_args=())
@@ -537,10 +540,10 @@ def _surface_median(
     scores: torch.Tensor,
     scales: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    ranges, confidence, none = _empty_answers(image, queries)
+    ranges, support, none = _empty_answers(image, queries)
     inputs = [_rays(image, queries, elevations, azimuths, wrap), scores, scales]
-    launch(_median[image.dtype], ranges.numel(), inputs, [ranges, confidence, none])
-    return ranges, confidence, none
+    launch(_median[image.dtype], ranges.numel(), inputs, [ranges, support, none])
+    return ranges, support, none
 
 
 _surface_median.register_fake(_empty_answers)
@@ -665,9 +668,10 @@ def surface_median(
 
     Returns:
         ranges: (..., Q) metres, 0 for no return, and NaN where a score or the query is NaN.
-        confidence: (..., Q), the probability that the range is right to 10 cm, or that nothing returns where the answer
-            says so.
-        no_return: (..., Q), the probability that nothing returns. Like the confidence it leaves out the ε of Eq. (4).
+        support: (..., Q, 4), the probability that the surface of each neighbour is met within 10 cm of the range; where
+            the answer is no return, the probability that the neighbour says so. The sum over the neighbours is the
+            confidence, the probability that the answer is right.
+        no_return: (..., Q), the probability that nothing returns. Like the support it leaves out the ε of Eq. (4).
 
     Raises:
         TypeError: If an argument is not a floating-point tensor of a supported dtype.
@@ -680,8 +684,8 @@ def surface_median(
     scores = _of_queries("scores", scores, batch, (count, 4, KINDS), image).detach()
     scales = _of_queries("scales", scales, batch, (count, 4), image).detach()
     op = reference.surface_median if backend == "torch" else _surface_median
-    ranges, confidence, none = op(image, queries, *tables, wrap, scores, scales)
-    return ranges.view(*batch, count), confidence.view(*batch, count), none.view(*batch, count)
+    ranges, support, none = op(image, queries, *tables, wrap, scores, scales)
+    return ranges.view(*batch, count), support.view(*batch, count, 4), none.view(*batch, count)
 
 
 def _checked(

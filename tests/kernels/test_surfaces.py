@@ -150,20 +150,22 @@ def test_the_probabilities_of_all_ranges_and_of_none_add_up_to_one():
 
 def test_the_median_is_a_hypothesis_with_half_of_the_weight_on_either_side():
     *rays, scores, scales, _ = draw(dtype=torch.float64)
-    median, confidence, none = surface_median(*rays, scores, scales)
+    median, support, none = surface_median(*rays, scores, scales)
     found = surface_hypotheses(*rays).flatten(-2)
     assert (found == median.unsqueeze(-1)).any(-1).all()
     # The expected error is least at a median.
     errors = [surface_likelihood(*rays, scores, scales, at, 1e3)[1] for at in (median, median * 0.99, median * 1.01)]
     assert (errors[0] <= torch.minimum(errors[1], errors[2]) + 1e-9)[median > 0].all()
     assert ((none > 0.5) == (median == 0)).float().mean() > 0.99
-    assert ((confidence >= 0) & (confidence <= 1)).all()
+    assert (support >= 0).all()
+    assert (support.sum(-1) <= 1).all()
 
 
-def test_confidence_is_the_probability_of_being_right_to_a_decimetre():
+def test_the_sum_of_the_support_is_the_probability_of_being_right_to_a_decimetre():
     image, queries, *others = draw(dtype=torch.float64, batch=1, count=30)
     elevations, azimuths, scores, scales, _ = others
-    median, confidence, none = surface_median(image, queries, elevations, azimuths, scores, scales)
+    median, support, none = surface_median(image, queries, elevations, azimuths, scores, scales)
+    confidence = support.sum(-1)
     steps = 400
     across = torch.linspace(-TOLERANCE, TOLERANCE, 2 * steps + 1, dtype=torch.float64)[1::2]
     many = [tensor.repeat_interleave(steps, 1) for tensor in (queries, scores, scales)]
@@ -173,6 +175,18 @@ def test_confidence_is_the_probability_of_being_right_to_a_decimetre():
     returned = median[0] > 0
     torch.testing.assert_close(confidence[0][returned], around[returned], rtol=1e-3, atol=BACKGROUND)
     torch.testing.assert_close(confidence[0][~returned], none[0][~returned])
+
+
+def test_the_neighbours_whose_surface_is_met_support_the_answer():
+    image = torch.tensor([[10.0, 30.0, 0.0], [10.0, 30.0, 0.0]])
+    tables = torch.tensor([0.0, 0.01]), torch.tensor([0.0, 0.01, 0.02])
+    queries = torch.tensor([[0.5, 0.25], [0.5, 0.75], [0.5, 1.75]])
+    scores = torch.tensor([0.0] * 8 + [9.0]).expand(3, 4, KINDS)  # nothing is continued
+    ranges, support, none = surface_median(image, queries, *tables, scores, torch.full((3, 4), -9.0), wrap=False)
+    torch.testing.assert_close(ranges, torch.tensor([10.0, 30.0, 0.0]))
+    nearer = 0.375 * torch.tensor([[1, 0, 1, 0], [0, 1, 0, 1], [0, 1, 0, 1]])  # their areas
+    torch.testing.assert_close(support, nearer, rtol=0, atol=0.01)
+    torch.testing.assert_close(none, torch.tensor([0.0, 0.0, 0.75]), rtol=0, atol=0.01)
 
 
 @pytest.mark.parametrize("backend", ["warp", "torch"])
@@ -239,9 +253,9 @@ def test_a_nan_score_makes_its_answer_nan_and_no_other(backend, device):
     scores[0, 3, 1, 4] = math.nan
     scores[1, 5] = -math.inf
     for answer in surface_median(*rays, scores, scales, backend=backend):
-        assert answer[0, 3].isnan()
-        assert answer[1, 5].isnan()
-        assert answer.isnan().sum() == 2
+        assert answer[0, 3].isnan().all()
+        assert answer[1, 5].isnan().all()
+        assert answer.isfinite().sum() == answer.numel() - 2 * answer[0, 3].numel()
 
 
 @pytest.mark.parametrize("count", [0, 1])
