@@ -184,7 +184,6 @@ def fused_decode(
     prior: str,
     wrap: bool,
     area_floor: float,
-    added: torch.Tensor | None,
     eps: float,
 ) -> torch.Tensor:
     """`kernels.fused_decode`: a `Projected`, image (B, H, W), queries (B, Q, 2) and `DecoderWeights`."""
@@ -198,7 +197,6 @@ def fused_decode(
     scores = F.linear(
         F.layer_norm(t, bias.shape, weights.head_norm[0], weights.head_norm[1], eps), *weights.score
     ).squeeze(-1)
-    scores = scores if added is None else scores + added
     return gather_blend(image, queries, scores, prior, wrap, area_floor)[0]
 
 

@@ -287,28 +287,6 @@ def _frame_time(model: models.Model) -> float:
     return min(seconds)
 
 
-def prior(study: Study) -> None:
-    """Ours: a geometric prior on the weights, and ranges that snap to planes."""
-    files: dict[str, models.Model] = {}
-    usual = models.create("iln-prior")
-    assert isinstance(usual, models.ILN)
-    for kind in ("none", "bilinear", "perspective", "planes"):
-        if kind == "none":
-            file = study.followed("iln")
-        elif kind == usual.prior:
-            file = study.followed("iln-prior")
-        else:
-            file = study.trained(f"iln-{kind}", "iln-prior", prior=kind)
-        for snap in (0.0, usual.snap):
-            model = models.load(file)
-            assert isinstance(model, models.ILN)
-            model.snap = snap
-            files[kind + (", snapped" if snap else "")] = model
-    rows = [{"prior": row.pop("model"), **row} for row in study.compare(files)]
-    study.write("prior", rows)
-    _bars(study, "prior", rows, "prior", "prior")
-
-
 def rays(study: Study) -> None:
     """Ours: the same budget on stored images, as in the paper, and on rays at continuous directions."""
     if study.archive is None:
@@ -316,27 +294,24 @@ def rays(study: Study) -> None:
             f"stored images are missing: make some with `python -m ilnet simulate --towns {','.join(towns.TRAIN)} "
             "--scans 2000 --sizes 16x1024,64x1024,128x2048 --out DIR`, and name them with --data DIR"
         )
-    rows = []
-    for learns_from, archive in (("continuous", None), ("stored", study.archive)):
-        for name in ("iln", "iln-prior"):
-            file = study.trained(f"{name}-stored", name, archive=archive) if archive else study.followed(name)
-            rows += [{"rays": learns_from, **row} for row in study.compare({name: file})]
+    files = {
+        "continuous": study.followed("iln"),
+        "stored": study.trained("iln-stored", "iln", archive=study.archive),
+    }
+    rows = [{"rays": kind, **row} for kind, file in files.items() for row in study.compare({"iln": file})]
     study.write("rays", rows)
-    _bars(study, "rays", [row for row in rows if row["model"] == "iln"], "rays", "learned from (iln)")
+    _bars(study, "rays", rows, "rays", "learned from")
 
 
 def _bars(study: Study, name: str, rows: Sequence[dict[str, Any]], by: str, title: str) -> None:
-    """Draws IoU and MAE by size; kinds that differ only after a comma share a colour."""
+    """Draws IoU and MAE by size, for each kind that stands in column `by`."""
     figure = Figure(figsize=(9, 3), layout="constrained")
     for axis, (key, words) in zip(figure.subplots(1, 2), (("iou", "IoU"), ("mae", "MAE [m]")), strict=True):
         kinds = list(dict.fromkeys(str(row[by]) for row in rows))
-        colours = dict(zip(dict.fromkeys(kind.partition(",")[0] for kind in kinds), _SERIES, strict=False))
-        for number, kind in enumerate(kinds):
+        for number, (kind, colour) in enumerate(zip(kinds, _SERIES, strict=False)):
             chosen = [row for row in rows if str(row[by]) == kind]
             at = np.arange(len(chosen)) + (number - (len(kinds) - 1) / 2) * 0.8 / len(kinds)
-            first, comma, _ = kind.partition(",")
-            look = {"color": colours[first], "hatch": "////" if comma else None, "edgecolor": "white", "linewidth": 0}
-            axis.bar(at, [row[key] for row in chosen], 0.8 / len(kinds), label=kind, **look)
+            axis.bar(at, [row[key] for row in chosen], 0.8 / len(kinds), label=kind, color=colour)
         axis.set_xticks(range(len(chosen)), [row["size"] for row in chosen])
         axis.set_ylabel(words)
     axis.legend(title=title, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
@@ -375,7 +350,6 @@ EXPERIMENTS: dict[str, Callable[[Study], None]] = {
     "table": table,
     "convergence": convergence,
     "attention": attention,
-    "prior": prior,
     "rays": rays,
     "real": real,
 }

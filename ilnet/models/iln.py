@@ -18,10 +18,9 @@ from kernels import (
     gather_blend,
     gather_neighbours,
     neighbour_attention,
-    plane_prior,
     project_pixels,
 )
-from kernels.checks import PRIORS
+from kernels.checks import check_prior
 
 __all__ = ["ILN", "Block"]
 
@@ -81,9 +80,9 @@ class ILN(Model):
 
     Args:
         depth: Number of attention blocks D.
-        prior: The interpolation that untrained weights start from: "none" (the paper); "bilinear" or "perspective", see
-            `kernels.gather_blend`; or "planes", see `kernels.plane_prior`. With a prior the head starts at zero, so
-            that the untrained network *is* that interpolation.
+        prior: The interpolation that untrained weights start from: "none" (the paper), "bilinear" or "perspective"; see
+            `kernels.gather_blend`. With a prior the head starts at zero, so that the untrained network *is* that
+            interpolation.
         features: Channels of the encoder and of the attention.
         blocks: Residual blocks of the encoder.
         heads: Attention heads; they divide `features`.
@@ -91,7 +90,6 @@ class ILN(Model):
         snap: Share of the range. In inference, a prediction that differs from that of `kernels.plane_prior` by less is
             replaced by it: the network decides which surface is seen, the planes decide where on it.
         area_floor: Least bilinear area in the prior; above 0, so that the network can overrule a measured pixel.
-        sharpness: Sharpness of the step that "planes" expects at an edge; low enough that its position can be learned.
         norm_range: The range [m] that the encoder sees as +1; no return is filled with it.
 
     Raises:
@@ -110,17 +108,15 @@ class ILN(Model):
         dropout: float = 0.0,
         snap: float = 0.0,
         area_floor: float = 1e-4,
-        sharpness: float = 4.0,
         norm_range: float = 100.0,
     ):
-        if prior not in (*PRIORS, "planes"):
-            raise ValueError(f"prior is {prior!r}; it should be one of {', '.join(PRIORS)}, planes")
+        check_prior(prior)
         if heads < 1 or features % heads:
             raise ValueError(f"heads is {heads}; it should divide the {features} features")
         if not 0 <= snap < 1:
             raise ValueError(f"snap is {snap}; it should be at least 0 and below 1, a share of the range")
         super().__init__()
-        self.prior, self.snap, self.area_floor, self.sharpness = prior, snap, area_floor, sharpness
+        self.prior, self.snap, self.area_floor = prior, snap, area_floor
         self.norm_range, self.dropout = norm_range, dropout
         self.encoder = Encoder(features, blocks)
         self.position = nn.Linear(2, features)
@@ -151,13 +147,9 @@ class ILN(Model):
 
     def _blend(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         features, projected = encoded
-        blocks, prior, planes = self.blocks, self.prior, None
-        if prior == "planes":  # scores to add, (B, Q, 4)
-            options = {"sharpness": self.sharpness, "area_floor": self.area_floor}
-            prior, planes = "none", plane_prior(image, queries, wrap, **options, backend=self.backend)
+        blocks, prior, floor = self.blocks, self.prior, self.area_floor
         if projected is not None and self.is_fused(encoded):  # all that follows as one kernel
-            floor, weights = self.area_floor, self._decoder_weights()
-            return fused_decode(projected, image, queries, weights, prior, wrap, area_floor=floor, added=planes)
+            return fused_decode(projected, image, queries, self._decoder_weights(), prior, wrap, area_floor=floor)
         if projected is None:  # tokens z (B, Q, 4, C): the feature of each neighbour and its embedded offset (Fig. 2)
             z, offsets = gather_neighbours(features, queries, wrap, self.backend)
             z = z + self.position(offsets * OFFSET_SCALE)
@@ -169,9 +161,7 @@ class ILN(Model):
         for block in blocks:
             z = block(z, self.backend)
         scores = self.head(z).squeeze(-1).to(image.dtype)
-        if planes is not None:
-            scores = scores + planes
-        return gather_blend(image, queries, scores, prior, wrap, area_floor=self.area_floor, backend=self.backend)
+        return gather_blend(image, queries, scores, prior, wrap, area_floor=floor, backend=self.backend)
 
     def is_fused(self, encoded: _Encoded) -> bool:
         """Returns whether the whole decoder is one kernel: in inference, at depth 1, if `fused_decode` can run."""

@@ -111,8 +111,6 @@ class _Blend:
 
     image: wp.array[float]
     """(B·H·W,): ranges r, metres."""
-    added: wp.array2d[float]
-    """(B·Q, 4): added to the scores; without rows, nothing is."""
     prior: int
     """Index of the prior in `PRIORS`."""
     area_floor: float
@@ -175,9 +173,6 @@ def _fused_decode_kernel(
                     score += wp.cw_mul(x[i, c], biases[3, c])
                 scores[t] = total(score)[0]
                 ranges[t] = blend.image[around.pixel[t]]
-            if blend.added.shape[0] > 0:
-                for t in range(4):
-                    scores[t] = scores[t] + blend.added[n, t]
             blended_out[n] = _blend(scores, ranges, queries[n, 0], queries[n, 1], blend.prior, blend.area_floor)
 
 
@@ -223,7 +218,6 @@ def _fused_decode(
     biases: torch.Tensor,
     prior: int,
     area_floor: float,
-    added: torch.Tensor,
     eps: float,
     wrap: bool,
 ) -> torch.Tensor:
@@ -233,7 +227,7 @@ def _fused_decode(
     tokens, x, h = pixels.new_empty(3, 4 * _GROUP * _WORKERS, channels)
     share = -(-batch * count // _WORKERS)
     table = fields(pixels, slope, shift, gram, HEADS, eps, wrap, per_image=count, groups=1)
-    blend = {"image": image.view(-1), "added": added.view(-1, 4), "prior": prior, "area_floor": area_floor}
+    blend = {"image": image.view(-1), "prior": prior, "area_floor": area_floor}
     scratch = {"tokens": tokens, "x": x, "x_scalars": x, "h": h, "h_scalars": h}
     inputs = [table, queries.view(-1, 2), weights, biases, blend, share]
     launch(_fused_decode_kernel, _WORKERS, inputs, [scratch, blended.view(-1)], least=1)
@@ -253,7 +247,6 @@ def fused_decode(
     wrap: bool = True,
     *,
     area_floor: float = 0.0,
-    added: torch.Tensor | None = None,
     eps: float = 1e-5,
     backend: str = "warp",
 ) -> torch.Tensor:
@@ -269,7 +262,6 @@ def fused_decode(
         prior: As in `gather_blend`.
         wrap: Whether column W-1 meets column 0 (a full circle). Otherwise columns clamp; rows always clamp.
         area_floor: As in `gather_blend`.
-        added: (B, Q, 4) scores of your own, such as `plane_prior`; they are added to the decoder's.
         eps: ε of the layer norms.
         backend: "warp", or "torch" for the plain twin in `kernels.reference`, which serves any table.
 
@@ -286,17 +278,14 @@ def fused_decode(
     check_prior(prior)
     check_area_floor(area_floor)
     check_queries(queries)
-    tensors = {"image": image, "queries": queries} | ({} if added is None else {"added": added})
-    check_devices(**projected.named(), **tensors, **weights.named())
+    check_devices(**projected.named(), image=image, queries=queries, **weights.named())
     batch, height, width, _ = projected.pixels.shape
     if image.shape != (batch, height, width):
         raise ValueError(f"image has shape {tuple(image.shape)}; it should be {(batch, height, width)}")
     if queries.ndim != 3 or len(queries) != batch:
         raise ValueError(f"queries has shape {tuple(queries.shape)}; it should be ({batch}, Q, 2)")
-    if added is not None and added.shape != (batch, queries.shape[1], 4):
-        raise ValueError(f"added has shape {tuple(added.shape)}; it should be {(batch, queries.shape[1], 4)}")
     if backend == "torch":
-        return reference.fused_decode(projected, image, queries, weights, prior, wrap, area_floor, added, eps)
+        return reference.fused_decode(projected, image, queries, weights, prior, wrap, area_floor, eps)
     if not fused_decode_serves(projected):
         pixels, heads, channels = projected.pixels, projected.heads, len(projected.shift) // 3
         raise ValueError(
@@ -313,6 +302,5 @@ def fused_decode(
         ).float()
         return _fused_decode(
             pixels.contiguous(), queries.to(pixels.dtype).contiguous(), slope, shift, gram, image.float().contiguous(),
-            matrices, rows, PRIORS.index(prior), area_floor,
-            pixels.new_empty(0, 4) if added is None else added.to(pixels.dtype).contiguous(), eps, wrap,
+            matrices, rows, PRIORS.index(prior), area_floor, eps, wrap,
         )  # fmt: skip

@@ -67,10 +67,10 @@ def whole_step(heads, features, queries, qkv_weight):
     return neighbour_attention(projected, queries, (qkv_weight[:64], qkv_weight.new_zeros(64)))
 
 
-def whole_decoder(features, queries, qkv_weight, image, scores):
+def whole_decoder(features, queries, qkv_weight, image):
     norm, matrix = (qkv_weight[0], qkv_weight[1]), (qkv_weight[:64], qkv_weight[2])
     weights = DecoderWeights(matrix, norm, matrix, matrix, norm, (qkv_weight[:1], qkv_weight[0, :1]))
-    return fused_decode(project(8, features, qkv_weight), image, queries, weights, "bilinear", added=scores)
+    return fused_decode(project(8, features, qkv_weight), image, queries, weights, "bilinear")
 
 
 RAYS = ("image", "queries", "elevations", "azimuths")
@@ -138,7 +138,7 @@ CASES = {
 
 OTHERS = {
     "plane_prior": Case(plane_prior, ("image", "queries")),
-    "fused_decode": Case(whole_decoder, ("features", "queries", "qkv_weight", "image", "scores")),
+    "fused_decode": Case(whole_decoder, ("features", "queries", "qkv_weight", "image")),
     "surface_hypotheses": Case(surface_hypotheses, RAYS),
     "surface_median": Case(lambda *tensors: surface_median(*tensors)[0], (*RAYS, "hypothesis_scores", "scores")),
 }

@@ -1,7 +1,6 @@
 import contextlib
 import copy
 import json
-import math
 import time
 import types
 from concurrent.futures import ThreadPoolExecutor
@@ -118,14 +117,10 @@ def plain_iln(model, image, queries, wrap):
         q, k, v = attention.qkv(attention.norm(z)).unflatten(-1, (3, attention.heads, -1)).transpose(2, 4).unbind(3)
         z = z + attention.out(F.scaled_dot_product_attention(q, k, v).transpose(2, 3).flatten(-2))
         z = z + block.feed_forward(z)
-    scores, prior = model.head(z).squeeze(-1), model.prior
-    if prior == "planes":
-        scores = scores + reference.plane_prior(image, queries, wrap, model.sharpness, model.area_floor)
-        prior = "none"
-    return reference.gather_blend(image, queries, scores, prior, wrap, model.area_floor)[0]
+    return reference.gather_blend(image, queries, model.head(z).squeeze(-1), model.prior, wrap, model.area_floor)[0]
 
 
-@pytest.mark.parametrize("prior", [*PRIORS, "planes"])
+@pytest.mark.parametrize("prior", PRIORS)
 @pytest.mark.parametrize("wrap", [True, False])
 @pytest.mark.parametrize("depth", [0, 1, 2])
 def test_iln_matches_a_plain_formulation_with_gradients(prior, wrap, depth):
@@ -184,13 +179,10 @@ def test_answers_close_to_the_planes_are_theirs_in_inference(backend):
     assert torch.equal(snapped[~close], ranges[~close])
 
 
-@pytest.mark.parametrize(
-    ("prior", "baseline"), [("bilinear", "bilinear"), ("perspective", "bilinear-inverse"), ("planes", "planes")]
-)
+@pytest.mark.parametrize(("prior", "baseline"), [("bilinear", "bilinear"), ("perspective", "bilinear-inverse")])
 def test_an_untrained_network_with_a_prior_is_that_interpolation(prior, baseline):
     torch.manual_seed(0)
-    sharp = {"area_floor": 0.0, "sharpness": math.inf}
-    model = models.create("iln", prior=prior, features=16, blocks=1, heads=4, **sharp).eval()
+    model = models.create("iln", prior=prior, features=16, blocks=1, heads=4, area_floor=0.0).eval()
     image, queries = draw()
     torch.testing.assert_close(model(image, queries), models.create(baseline)(image, queries), rtol=0, atol=METRES)
 

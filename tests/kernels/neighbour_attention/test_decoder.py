@@ -7,9 +7,7 @@ import torch.nn.functional as F
 from kernels import (
     DecoderWeights,
     fused_decode,
-    gather_neighbours,
     neighbour_attention,
-    plane_prior,
     project_pixels,
     reference,
 )
@@ -63,17 +61,6 @@ def test_is_the_decoder_layer_by_layer(channels, prior, wrap, poisoned):
         torch.testing.assert_close(ranges, expected, rtol=0, atol=METRES)
 
 
-def test_scores_may_be_added(poisoned):
-    projected, image, queries, weights = draw()
-    added = plane_prior(image, queries, area_floor=1e-3)
-    ranges, plain = (
-        fused_decode(projected, image, queries, weights, added=added, backend=backend) for backend in ("warp", "torch")
-    )
-    torch.testing.assert_close(ranges, plain, rtol=0, atol=METRES)
-    with pytest.raises(ValueError, match=r"added has shape \(2, 500\)"):
-        fused_decode(projected, image, queries, weights, added=added[..., 0])
-
-
 def test_any_number_of_queries_and_cores():
     projected, image, queries, weights = draw(count=1000)
     expected = fused_decode(projected, image, queries, weights)
@@ -90,38 +77,18 @@ def test_any_number_of_queries_and_cores():
         torch.set_num_threads(cores)
 
 
-def test_a_score_of_minus_infinity_and_an_area_of_zero_shut_a_neighbour_out():
+def test_an_area_of_zero_shuts_a_neighbour_out():
     projected, image, queries, weights = draw()
     on_pixels = queries.round().clamp(min=0) % torch.tensor([5, 16])
     ranges = fused_decode(projected, image, on_pixels, weights, "bilinear")
     row, column = on_pixels.long().unbind(-1)
     torch.testing.assert_close(ranges, image[torch.arange(2).unsqueeze(1), row, column], rtol=0, atol=METRES)
-    gathered, _ = gather_neighbours(image.unsqueeze(1), queries)
-    for t in range(4):
-        added = torch.full((2, queries.shape[1], 4), -torch.inf)
-        added[..., t] = 0
-        ranges = fused_decode(projected, image, queries, weights, added=added)
-        torch.testing.assert_close(ranges, gathered[..., t, 0], rtol=0, atol=METRES)
 
 
 def test_opcheck_without_gradients():
     (pixels, slope, shift, gram, _), image, queries, _ = draw(count=9)
     matrices, rows = torch.randn(3, C, C), torch.randn(4, C)
-    arguments = (
-        pixels,
-        queries,
-        slope,
-        shift,
-        gram,
-        image,
-        matrices,
-        rows,
-        1,
-        1e-3,
-        torch.randn(2, 9, 4),
-        1e-5,
-        True,
-    )
+    arguments = pixels, queries, slope, shift, gram, image, matrices, rows, 1, 1e-3, 1e-5, True
     torch.library.opcheck(_fused_decode, arguments)
 
 
@@ -141,17 +108,15 @@ def test_what_it_does_not_serve_is_named():
 
 def test_a_tensor_on_another_device_is_named():
     projected, image, queries, weights = draw(count=9)
-    added = torch.zeros(2, 9, 4)
 
-    def refused(name, projected=projected, image=image, queries=queries, weights=weights, added=added):
+    def refused(name, projected=projected, image=image, queries=queries, weights=weights):
         with pytest.raises(ValueError, match=rf"{re.escape(name)} is on meta; it should be on cpu, where projected"):
-            fused_decode(projected, image, queries, weights, added=added)
+            fused_decode(projected, image, queries, weights)
 
     for name in ("slope", "shift", "gram"):
         refused(f"projected.{name}", projected=projected._replace(**{name: getattr(projected, name).to("meta")}))
     refused("image", image=image.to("meta"))
     refused("queries", queries=queries.to("meta"))
-    refused("added", added=added.to("meta"))
     for name in weights._fields:
         for i in range(2):
             pair = [tensor.to("meta") if j == i else tensor for j, tensor in enumerate(getattr(weights, name))]
