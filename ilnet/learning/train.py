@@ -9,8 +9,9 @@ import math
 import multiprocessing
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -187,6 +188,8 @@ def train(
     target: tuple[int, int] = PAPER_TARGET.shape,
     sensors: Sequence[Sensor] | None = None,
     probe: Sequence[Pair] = (),
+    make: Callable[..., models.Model] | None = None,
+    validations: int = VALIDATIONS,
     **arguments: Any,
 ) -> dict[str, float]:
     """Trains a model and writes its weights and figures; an interrupted run in `out` goes on where it stopped.
@@ -207,6 +210,9 @@ def train(
             `data.ContinuousRays`. By default the paper's, and for iln-surfaces any.
         probe: Pairs of an input scan and the scan to be predicted. Their figures are logged as `test/...` and decide
             nothing.
+        make: What makes the untrained model from its arguments, by default `models.create`. Its weights should be those
+            of a model called `name`, as which they are written; its loss may be another one.
+        validations: How often held-out scans are measured. The weights that were best there are written.
         **arguments: Arguments of the model; they override the preset's.
 
     Returns:
@@ -217,7 +223,7 @@ def train(
             an interrupted run of another kind, there are `sensors` as well as an `archive`, a process has no GPU of its
             own, or a loss is not finite.
     """
-    plan = _plan(name, preset_name, steps, seed, archive, target, sensors, arguments)
+    plan = _plan(name, preset_name, steps, seed, archive, target, sensors, make, validations, arguments)
     start = _steps_done(out / name / "last.ckpt", plan.run)
     training, batches, scans = _build(plan, start, probe)
     return _run(plan, training, batches, scans, out, start)
@@ -233,10 +239,13 @@ class _Plan:
     """What a training does, its arguments checked."""
 
     name: str
+    make: Callable[..., models.Model]
+    """Makes the untrained model from `arguments`."""
     size: Preset
     arguments: dict[str, Any]
     """Arguments of the model."""
     steps: int
+    validations: int
     seed: int
     stored: data.Archive | data.RangeImageTree | None
     """Stored images to learn from; None for continuous rays."""
@@ -257,6 +266,8 @@ def _plan(
     archive: Path | None,
     target: tuple[int, int],
     sensors: Sequence[Sensor] | None,
+    make: Callable[..., models.Model] | None,
+    validations: int,
     arguments: dict[str, Any],
 ) -> _Plan:
     """Checks the arguments of `train` and completes them from the preset."""
@@ -287,8 +298,10 @@ def _plan(
     if archive is None:
         names = [sensor.name or sensor.size for sensor in sensors] or ["any"]
         learns_from = {"data": "continuous rays", "sensors": names}
-    run = {"preset": preset_name, "steps": steps, "seed": seed, **learns_from, **arguments}
-    return _Plan(name, size, arguments, steps, seed, stored, per_epoch, target, sensors, run)
+    variant = {"variant": make.__name__} if make else {}
+    run = {"preset": preset_name, "steps": steps, "seed": seed, **learns_from, **variant, **arguments}
+    make = make or partial(models.create, name)
+    return _Plan(name, make, size, arguments, steps, validations, seed, stored, per_epoch, target, sensors, run)
 
 
 def _build(
@@ -297,7 +310,7 @@ def _build(
     """Returns the training, its batches from step `start` on, and the numbers of the scans that validate it."""
     device, part = _device(), (int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1)))
     lightning.seed_everything(plan.seed, verbose=False)
-    model = models.create(plan.name, **plan.arguments)
+    model = plan.make(**plan.arguments)
     samples = _samples(plan, start, part, device)
     held_out = [
         (scan, truth)
@@ -332,7 +345,7 @@ def _run(
         accelerator=simulate.best_device().type,
         **_processes(int(os.environ.get("WORLD_SIZE", 1))),
         use_distributed_sampler=False,
-        val_check_interval=min(max(VALIDATE_EVERY[0], steps // VALIDATIONS), VALIDATE_EVERY[1], steps),
+        val_check_interval=min(max(VALIDATE_EVERY[0], steps // plan.validations), VALIDATE_EVERY[1], steps),
         num_sanity_val_steps=0,
         gradient_clip_val=LARGEST_GRADIENT.get(plan.name),
         log_every_n_steps=READ_EVERY,

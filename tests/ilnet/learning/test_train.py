@@ -72,6 +72,30 @@ def test_the_sensors_of_a_training_can_be_chosen(tmp_path, quick):
         assert json.loads(file.metadata()["sensors"]) == ["os1-32"]
 
 
+def test_a_variant_of_a_model_learns_by_its_own_loss_and_is_written_as_that_model(tmp_path, quick):
+    losses = []
+
+    class Variant(models.ILN):
+        def loss(self, *batch, **options):
+            losses.append(super().loss(*batch, **options))
+            return losses[-1]
+
+    quick(tmp_path, "iln", make=Variant, steps=3)
+    assert len(losses) == 3
+    with safe_open(tmp_path / "iln.safetensors", "pt") as file:
+        assert json.loads(file.metadata()["variant"]) == "Variant"
+    assert type(models.load(tmp_path / "iln.safetensors")) is models.ILN
+
+
+def test_the_number_of_validations_can_be_chosen(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(train, "VALIDATE_EVERY", (1, 2000))
+    for validations in (1, 3):
+        quick(tmp_path / str(validations), steps=6, validations=validations)
+        [log] = (tmp_path / str(validations)).glob("*/from-step-0/metrics.csv")
+        with open(log) as rows:
+            assert sum(bool(row["val/iou"]) for row in csv.DictReader(rows)) == validations
+
+
 def test_the_rate_of_surfaces_is_at_most_that_of_the_preset(tmp_path, quick, monkeypatch):
     for rate in (1e-4, 1e-3):
         monkeypatch.setitem(train.PRESETS, "tiny", dataclasses.replace(train.PRESETS["tiny"], rate=rate))
