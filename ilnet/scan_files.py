@@ -27,7 +27,7 @@ import torch
 from ilnet.scan import Scan, real_tensor
 from ilnet.sensor import Sensor, preset
 
-__all__ = ["UnknownSensor", "read", "write"]
+__all__ = ["UnknownSensor", "listed", "read", "write"]
 
 
 def read(path: str | Path, sensor: Sensor | None = None) -> Scan:
@@ -58,6 +58,23 @@ def read(path: str | Path, sensor: Sensor | None = None) -> Scan:
         # One line, whatever a library wrote.
         raise ValueError(f"{path}: {' '.join(str(error).split())}") from error
     return scan
+
+
+def listed(path: Path) -> list[Path]:
+    """Returns the file that a path names or, for a folder, the files in it by name, without folders and hidden files.
+
+    Raises:
+        FileNotFoundError: If there is no such file or folder.
+        ValueError: If there is no file in the folder.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file or folder")
+    if not path.is_dir():
+        return [path]
+    paths = sorted(inside for inside in path.iterdir() if inside.is_file() and not inside.name.startswith("."))
+    if not paths:
+        raise ValueError(f"{path}: there is no file in this folder")
+    return paths
 
 
 def write(path: str | Path, scan: Scan) -> None:

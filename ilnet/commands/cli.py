@@ -1,6 +1,7 @@
 """The command line: `python -m ilnet COMMAND`."""
 
 import json
+import math
 import os
 import sys
 from pathlib import Path
@@ -130,12 +131,20 @@ def train(
 
 
 @cli.command()
+@click.argument("files", nargs=-1, type=Path)
 @click.option(
     "--model", "names", multiple=True, required=True, metavar="NAME|FILE", help="A model to measure; may be repeated."
 )
 @click.option("--scene", metavar="TOWN|MESH", help="Scan this town, or this mesh file (metres, z up).")
 @click.option("--at", type=Path, metavar="FILE", help='Positions in the mesh: {"positions": [[x, y, z], ...]} [m].')
-@click.option("--scan", type=Path, metavar="FILE", help="Keep some beams of this scan; predict all.")
+@click.option(
+    "--scan",
+    "measured",
+    type=Path,
+    multiple=True,
+    metavar="FILE|FOLDER",
+    help="Keep some beams of this scan, or of each in a folder; predict all. May be repeated.",
+)
 @click.option("--rows", type=int, metavar="N", help="Beams of the scan to keep; 16 by default.")
 @click.option("--sensor", metavar="NAME", help="Preset with the scan's angles, if the file does not hold them.")
 @click.option("--size", type=_Size(), help="Rays to predict in the scene; 128x2048 by default.")
@@ -145,56 +154,119 @@ def train(
     help="Scans of the scene; by default 8 of a town, or all positions in a mesh.",
 )
 @click.option(
+    "--protocol", type=click.Choice(["kitti"]), help="Measure KITTI's files FILES, or those in folders, as others do."
+)
+@click.option(
     "--json", "as_json", is_flag=True, help="Print an object instead of the table, or a list for many models."
 )
 def evaluate(
+    files: tuple[Path, ...],
     names: tuple[str, ...],
     scene: str | None,
     at: Path | None,
-    scan: Path | None,
+    measured: tuple[Path, ...],
     rows: int | None,
     sensor: str | None,
     size: tuple[int, int] | None,
     scans: int | None,
+    protocol: str | None,
     as_json: bool,
 ) -> None:
-    """Measure models on scans of a scene, seen with 16x1024 rays, or on a measured scan."""
-    if bool(scene) == bool(scan):
-        raise click.UsageError("give --scene TOWN|MESH or --scan FILE")
-    if scan and (at or size or scans):
+    """Measure models on scans of a scene, seen with 16x1024 rays, on measured scans, or by a protocol on FILES."""
+    if [bool(scene), bool(measured), bool(protocol)].count(True) != 1:
+        raise click.UsageError("give --scene TOWN|MESH, --scan FILE or --protocol kitti FILE")
+    if bool(protocol) != bool(files):
+        raise click.UsageError("--protocol kitti and FILES go together; --scan FILE names other scans")
+    if not scene and (at or size or scans):
         raise click.UsageError("--at, --size and --scans go with --scene; a scan is judged at its own size")
-    if scene and (rows is not None or sensor is not None):
+    if not measured and (rows is not None or sensor is not None):
         raise click.UsageError("--rows and --sensor go with --scan FILE")
-    from ilnet import models
+    from ilnet import models, scan_files
+    from ilnet.learning import evaluate
+    from ilnet.world import simulate
+
+    loaded = {name: models.load(name).to(simulate.best_device()) for name in names}
+    if protocol:
+        _evaluate_kitti(loaded, files, as_json)
+        return
+    if measured:
+        pairs = [_scan_pair(path, rows, sensor) for named in measured for path in scan_files.listed(named)]
+    else:
+        pairs = _scene_pairs(str(scene), at, size, scans)
+    figures = evaluate.scan_by_scan(loaded, pairs)
+    results = evaluate.summary(figures, pairs)
+    if as_json:
+        click.echo(_json(results[0] if len(results) == 1 else results))
+        return
+    click.echo(f"{scene or ', '.join(map(str, measured))}: {len(pairs)} scan(s) -> {results[0]['size']}\n")
+    click.echo(_table({result["model"]: result for result in results}))
+    if len(pairs) > 1:
+        click.echo("\n" + "\n".join(_intervals(results)))
+
+
+def _scene_pairs(scene: str, at: Path | None, size: tuple[int, int] | None, scans: int | None) -> list[Any]:
+    """Returns pairs of scans of a town or a mesh."""
     from ilnet.learning import evaluate
     from ilnet.sensor import PAPER_INPUT, PAPER_TARGET
     from ilnet.world import meshes, towns
 
-    loaded = {name: models.load(name) for name in names}
     output = PAPER_INPUT.resize(*(size or PAPER_TARGET.shape))
-    if scan:
-        pairs = [_scan_pair(scan, rows, sensor)]
-    elif scene in towns.NAMES:
+    if scene in towns.NAMES:
         if at:
             raise click.UsageError("--at goes with a mesh; a town has its own waypoints")
-        pairs = evaluate.town_pairs(scene, scans or 8, output)
-    else:
-        mesh = Path(str(scene))
-        if not mesh.exists():
-            raise click.UsageError(f"--scene {scene} is neither a town ({', '.join(towns.NAMES)}) nor a mesh file")
-        if at is None:
-            raise click.UsageError("--scene MESH needs --at FILE, the positions of the sensor in the mesh")
-        positions = [tuple(position) for position in meshes.read_positions(at).tolist()]
-        if scans and scans > len(positions):
-            raise click.UsageError(f"--scans is {scans}, but {at} holds {len(positions)} positions")
-        pairs = evaluate.mesh_pairs(mesh, positions[:scans], output)
-    device = pairs[0][0].ranges.device
-    results = evaluate.measure({name: model.to(device) for name, model in loaded.items()}, pairs)
+        return evaluate.town_pairs(scene, scans or 8, output)
+    mesh = Path(scene)
+    if not mesh.exists():
+        raise click.UsageError(f"--scene {scene} is neither a town ({', '.join(towns.NAMES)}) nor a mesh file")
+    if at is None:
+        raise click.UsageError("--scene MESH needs --at FILE, the positions of the sensor in the mesh")
+    positions = [tuple(position) for position in meshes.read_positions(at).tolist()]
+    if scans and scans > len(positions):
+        raise click.UsageError(f"--scans is {scans}, but {at} holds {len(positions)} positions")
+    return evaluate.mesh_pairs(mesh, positions[:scans], output)
+
+
+def _evaluate_kitti(loaded: dict[str, Any], files: tuple[Path, ...], as_json: bool) -> None:
+    from ilnet.learning import kitti
+
+    results = kitti.judge(loaded, kitti.files(files))
     if as_json:
-        click.echo(json.dumps(results[0] if len(results) == 1 else results))
+        click.echo(_json(results))
         return
-    click.echo(f"{scene or scan}: {len(pairs)} scan(s) -> {results[0]['size']}\n")
-    click.echo(_table({result["model"]: result for result in results}))
+    for kind, title in kitti.TITLES.items():
+        click.echo(f"{title}\n{'method':18}{'MAE [m]':>11}{'IoU':>11}{'Chamfer':>11}")
+        for result in results:
+            found = result.get(kind, result)
+            click.echo(f"{result['model']:18}" + "".join(f"{found[key]:11.3f}" for key in ("mae", "iou", "chamfer")))
+        click.echo("")
+    click.echo(f"Means over {results[0]['scans']} file(s); --json has each.")
+
+
+def _intervals(results: list[dict[str, Any]]) -> list[str]:
+    """Returns lines that tell how sure the figures are, and which model is ahead."""
+    lines = ["95 % intervals over scans, and the difference from the first method, scan by scan:"]
+    for result in results:
+        low, high = result["iou_interval"]
+        line = f"{result['model']:18} IoU {result['iou']:.3f} [{low:.3f}, {high:.3f}]"
+        if "iou_difference" in result:
+            less, more = result["iou_difference_interval"]
+            line += f"   {result['iou_difference']:+.3f} [{less:+.3f}, {more:+.3f}]"
+            line += "  ahead" if less > 0 else "  behind" if more < 0 else "  no clear difference"
+        lines.append(line)
+    return lines
+
+
+def _json(value: Any) -> str:
+    """Returns JSON, in which an undefined figure is null."""
+
+    def defined(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: defined(item) for key, item in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [defined(item) for item in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(defined(value))
 
 
 @cli.command()
@@ -441,9 +513,10 @@ def _table(methods: dict[str, dict[str, Any]]) -> str:
         "floating": "floating",
         "edge_mae": "at edges",
     }
+    columns |= {"chamfer": "Chamfer [m]"} if all("chamfer" in figures for figures in methods.values()) else {}
     width = max(18, *map(len, methods))
-    lines = [f"{'method':{width}}" + "".join(f"{title:>11}" for title in columns.values())]
-    lines += [f"{name:{width}}" + "".join(f"{figures[c]:11.3f}" for c in columns) for name, figures in methods.items()]
+    lines = [f"{'method':{width}}" + "".join(f"{title:>12}" for title in columns.values())]
+    lines += [f"{name:{width}}" + "".join(f"{figures[c]:12.3f}" for c in columns) for name, figures in methods.items()]
     return "\n".join(lines)
 
 

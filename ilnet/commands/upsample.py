@@ -78,8 +78,5 @@ def _tasks(source: Path, out: Path, suffix: str) -> Iterator[tuple[Path, Path]]:
     out.mkdir(parents=True, exist_ok=True)
     if out.samefile(source):
         raise ValueError(f"out is {out}, the folder to be read; it should be another folder")
-    paths = sorted(path for path in source.iterdir() if path.is_file() and not path.name.startswith("."))
-    if not paths:
-        raise ValueError(f"{source}: there is no file in this folder")
-    for path in paths:
+    for path in scan_files.listed(source):
         yield path, out / f"{path.stem}{suffix}"

@@ -3,10 +3,13 @@
 The pairs that are made here are on `simulate.best_device()`.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy import stats
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from ilnet import models, scan_files
@@ -15,10 +18,10 @@ from ilnet.scan import Pair
 from ilnet.sensor import PAPER_INPUT, Sensor, preset
 from ilnet.world import places, simulate
 
-__all__ = ["measure", "mesh_pairs", "scan_pair", "town_pairs"]
+__all__ = ["interval", "measure", "mesh_pairs", "scan_by_scan", "scan_pair", "summary", "town_pairs"]
 
 # The figures of the paper, and those that tell whether edges stay sharp.
-_FIGURES = ("mae", "iou", "precision", "recall", "f1", "floating", "edge_mae")
+_FIGURES = ("mae", "iou", "precision", "recall", "f1", "floating", "edge_mae", "chamfer")
 
 
 def town_pairs(name: str, count: int, output: Sensor) -> list[Pair]:
@@ -101,26 +104,84 @@ def measure(loaded: Mapping[str, models.Model], pairs: Sequence[Pair]) -> list[d
 
     Args:
         loaded: The models, by their names in the results, on the device of the scans.
-        pairs: At least one pair of what a model sees and what it should predict, all of the same two sensors and on one
-            device.
+        pairs: At least one pair of what a model sees and what it should predict, all on one device.
 
     Returns:
-        For each model its name as `model`, the `size` of its predictions, the number of `scans`, and the means over
-        them of `mae`, `edge_mae` [m], `iou`, `precision`, `recall`, `f1` and `floating`; see `metrics.compare`.
+        For each model its name as `model`, the `size` of its predictions ("mixed" if they differ), the number of
+        `scans`, and the means over them of `mae`, `edge_mae`, `chamfer` [m], `iou`, `precision`, `recall`, `f1` and
+        `floating`; see `metrics.compare` and `metrics.chamfer`.
 
     Raises:
-        ValueError: If a model is not on the scans' device, or cannot predict this sensor.
+        ValueError: If a model is not on the scans' device, or cannot predict a sensor.
     """
-    scan, truth = pairs[0]
-    device = scan.ranges.device
-    results = []
+    figures = scan_by_scan(loaded, pairs)
+    return [_means(name, figures[name], pairs) for name in loaded]
+
+
+def scan_by_scan(loaded: Mapping[str, models.Model], pairs: Sequence[Pair]) -> dict[str, list[dict[str, float]]]:
+    """Returns for each model the figures of each pair; arguments, figures and errors are those of `measure`."""
+    device = pairs[0][0].ranges.device
+    clouds = [metrics.cloud(truth.ranges, truth.sensor) for _, truth in pairs]
+    results: dict[str, list[dict[str, float]]] = {}
     with tqdm(total=len(loaded) * len(pairs), unit="scan", desc="evaluate") as progress:
         for name, model in loaded.items():
-            frames = models.Upsampler(model, scan.sensor, truth.sensor, device=device)
-            mean = metrics.ScanMetrics().to(device)
-            for sparse, dense in pairs:
-                mean.update(frames.ranges(sparse), dense)
+            frames: models.Upsampler | None = None
+            results[name] = []
+            for (sparse, dense), cloud in zip(pairs, clouds, strict=True):
+                if frames is None or (frames.source, frames.target) != (sparse.sensor, dense.sensor):
+                    frames = models.Upsampler(model, sparse.sensor, dense.sensor, device=device)
+                ranges = frames.ranges(sparse)
+                figures = metrics.compare(ranges, dense)
+                figures["chamfer"] = metrics.chamfer(metrics.cloud(ranges, dense.sensor), cloud)
+                results[name].append({figure: figures[figure] for figure in _FIGURES})
                 progress.update()
-            figures = {figure: value.item() for figure, value in mean.compute().items() if figure in _FIGURES}
-            results.append({"model": name, "size": truth.sensor.size, "scans": len(pairs), **figures})
     return results
+
+
+def summary(figures: Mapping[str, Sequence[Mapping[str, float]]], pairs: Sequence[Pair]) -> list[dict[str, Any]]:
+    """Returns what `measure` does, and how sure it is, given what `scan_by_scan` returned for these pairs.
+
+    Of two scans or more, `iou_interval` and `mae_interval` are 95 % intervals of the means. `iou_difference` and
+    `mae_difference` are the mean differences from the first model, scan by scan, and `iou_difference_interval` and
+    `mae_difference_interval` their intervals: a model is ahead in IoU where the whole interval is above 0.
+    """
+    results = []
+    first = next(iter(figures.values()))
+    for name, found in figures.items():
+        result = _means(name, found, pairs)
+        for key in ("iou", "mae") if len(pairs) > 1 else ():
+            result[f"{key}_interval"] = interval([scan[key] for scan in found])
+            if found is not first:
+                differences = [scan[key] - other[key] for scan, other in zip(found, first, strict=True)]
+                result[f"{key}_difference"] = _mean(differences)
+                result[f"{key}_difference_interval"] = interval(differences)
+        results.append(result)
+    return results
+
+
+def _means(name: str, figures: Sequence[Mapping[str, float]], pairs: Sequence[Pair]) -> dict[str, Any]:
+    sizes = {truth.sensor.size for _, truth in pairs}
+    means = {figure: _mean([scan[figure] for scan in figures]) for figure in _FIGURES}
+    return {"model": name, "size": sizes.pop() if len(sizes) == 1 else "mixed", "scans": len(pairs), **means}
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Returns the mean of those values that are defined; NaN if none is."""
+    defined = [value for value in values if not math.isnan(value)]
+    return sum(defined) / len(defined) if defined else math.nan
+
+
+def interval(values: Sequence[float]) -> tuple[float, float] | None:
+    """Returns the 95 % bootstrap interval of the mean over scans, by percentiles.
+
+    Args:
+        values: A figure of each scan, or the difference of two models in it, which tells whether one is ahead.
+
+    Returns:
+        Its ends; None if there are fewer than two defined values, which say nothing of others.
+    """
+    defined = [value for value in values if not math.isnan(value)]
+    if len(defined) < 2:
+        return None
+    found = stats.bootstrap((defined,), np.mean, method="percentile", rng=0).confidence_interval
+    return float(found.low), float(found.high)

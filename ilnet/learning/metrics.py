@@ -4,12 +4,13 @@ from collections.abc import Callable, Iterator
 
 import torch
 import torch.nn.functional as F
+from scipy.spatial import KDTree
 from torchmetrics import Metric
 
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 
-__all__ = ["FIGURES", "VOXEL", "ScanMetrics", "compare", "edges", "floating", "voxels"]
+__all__ = ["FIGURES", "VOXEL", "ScanMetrics", "chamfer", "cloud", "compare", "edges", "floating", "voxels"]
 
 FIGURES = ("mae", "iou", "precision", "recall", "f1", "floating", "edge_mae", "flat_mae")
 # Edge length of the voxels [m] (paper, Sec. III-B).
@@ -36,14 +37,33 @@ def voxels(points: torch.Tensor) -> torch.Tensor:
     return torch.unique((x << 42) + (y << 21) + z)
 
 
+def chamfer(one: torch.Tensor, other: torch.Tensor) -> float:
+    """Returns the Chamfer distance of two point clouds.
+
+    It is the mean distance from a point of the one cloud to the nearest of the other, plus the mean the other way.
+
+    Args:
+        one: (N, 3) metres.
+        other: (M, 3) metres.
+
+    Returns:
+        Metres; NaN if a cloud has no point.
+    """
+    if not (len(one) and len(other)):
+        return float("nan")
+    clouds = [points.double().cpu().numpy() for points in (one, other)]
+    there, back = (KDTree(b).query(a, workers=-1)[0] for a, b in (clouds, clouds[::-1]))
+    return float(there.mean() + back.mean())
+
+
 def _returns(ranges: torch.Tensor, sensor: Sensor) -> torch.Tensor:
     return (ranges >= sensor.min_range) & (ranges <= sensor.max_range)
 
 
-def _occupied(ranges: torch.Tensor, truth: Scan) -> torch.Tensor:
-    """Returns the voxels of those ranges (H, W) that lie within the limits of the sensor."""
-    within = _returns(ranges, truth.sensor)
-    return voxels(truth.sensor.directions().to(ranges.device)[within] * ranges[within].unsqueeze(-1))
+def cloud(ranges: torch.Tensor, sensor: Sensor) -> torch.Tensor:
+    """Returns the points (N, 3) [m] of those ranges (H, W) [m] that lie within the limits of the sensor."""
+    within = _returns(ranges, sensor)
+    return sensor.directions().to(ranges.device)[within] * ranges[within].unsqueeze(-1)
 
 
 def _padded(image: torch.Tensor, wrap: bool) -> torch.Tensor:
@@ -158,7 +178,7 @@ def compare(ranges: torch.Tensor, truth: Scan) -> dict[str, float]:
         raise ValueError(f"ranges holds {int((~ranges.isfinite()).sum())} NaN or infinite values; all should be finite")
     ranges = ranges.clamp(0, truth.sensor.norm_range)
     error, at_edge = (ranges - truth.filled()).abs(), edges(truth)
-    predicted, true = _occupied(ranges, truth), _occupied(truth.filled(), truth)
+    predicted, true = (voxels(cloud(image, truth.sensor)) for image in (ranges, truth.filled()))
     common = int(torch.isin(predicted, true, assume_unique=True).sum())
     precision = common / max(len(predicted), 1)
     recall = common / max(len(true), 1)

@@ -30,3 +30,24 @@ def test_a_model_elsewhere_is_refused_and_stays_there(pair):
     with pytest.raises(ValueError, match="model is on meta; it should be on cpu"):
         evaluate.measure({"iln": model}, [pair])
     assert {weight.device.type for weight in model.parameters()} == {"meta"}
+
+
+def test_intervals_hold_the_mean_and_tell_who_is_ahead(pair):
+    scan, truth = pair
+    half = scan.decimate(4), truth
+    loaded = {"nearest": models.load("nearest"), "planes": models.load("planes")}
+    nearest, planes = evaluate.summary(evaluate.scan_by_scan(loaded, [pair, half, pair]), [pair, half, pair])
+    for row in (nearest, planes):
+        low, high = row["iou_interval"]
+        assert low < row["iou"] < high
+    assert planes["iou_difference"] == pytest.approx(planes["iou"] - nearest["iou"])
+    assert planes["iou_difference_interval"][0] > 0
+    assert "iou_difference" not in nearest
+    [alone] = evaluate.summary(evaluate.scan_by_scan({"planes": models.load("planes")}, [pair]), [pair])
+    assert "iou_interval" not in alone  # one scan says nothing of others
+
+
+def test_interval_of_few_values():
+    assert evaluate.interval([0.5]) is None
+    assert evaluate.interval([0.5, float("nan")]) is None
+    assert evaluate.interval([0.5, 0.5]) == (0.5, 0.5)

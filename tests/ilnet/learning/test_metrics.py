@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ilnet import models
-from ilnet.learning.metrics import FIGURES, ScanMetrics, compare, edges, floating, voxels
+from ilnet.learning.metrics import FIGURES, ScanMetrics, chamfer, compare, edges, floating, voxels
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
 
@@ -212,3 +212,13 @@ def test_processes_add_up_to_one(tmp_path):
     assert alone["mae"] > 1
     assert alone["floating"] > 0
     assert both == [pytest.approx(alone, rel=1e-9)] * 2
+
+
+def test_chamfer_distance_by_hand():
+    one = torch.tensor([[0.0, 0, 0], [4.0, 0, 0]])
+    other = torch.tensor([[0.0, 1, 0], [0.0, 3, 0]])
+    # There 1 and sqrt(16 + 1) m, back 1 and 3 m.
+    assert chamfer(one, other) == pytest.approx((1 + 17**0.5) / 2 + 2)
+    assert chamfer(one, other) == chamfer(other, one)
+    assert chamfer(one, one) == 0
+    assert math.isnan(chamfer(one, one[:0]))
