@@ -3,14 +3,21 @@
 A range of 0 means no return. Points are in the sensor frame, see `ilnet.sensor`.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from ilnet.sensor import Sensor, directions_to_angles
 
-__all__ = ["Pair", "Scan", "real_tensor"]
+__all__ = ["OF_RETURNS", "Pair", "Scan", "real_tensor"]
+
+# The fields of a scan that hold a value from 0 to 1 for each return, and what to do about other values.
+OF_RETURNS = {
+    "intensity": "divide it by the largest that the sensor reports",
+    "confidence": "they should be probabilities",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,16 +27,22 @@ class Scan:
     Args:
         ranges: (H, W) [m], finite and >= 0; 0 is no return. They are stored as float32.
         sensor: The sensor that measured them, of shape (H, W).
-        intensity: (H, W) strength of each return, from 0 to 1; None where it was not measured. It is stored as float32
-            on the device of `ranges`, and as 0 where there is no return.
+        intensity: (H, W) strength of each return, from 0 to 1; None where it was not measured.
+        confidence: (H, W) probability of each return that its range is right to 10 cm, from 0 to 1, in a scan that was
+            predicted; None where nobody told it.
+
+    Intensity and confidence are those of returns: they are stored as 0 where there is none. They are float32, on the
+    device of `ranges`.
 
     Raises:
-        ValueError: If the shapes differ, a range is NaN, infinite or negative, or an intensity is not in [0, 1].
+        ValueError: If the shapes differ, a range is NaN, infinite or negative, or intensity or confidence is not in
+            [0, 1].
     """
 
     ranges: torch.Tensor
     sensor: Sensor
     intensity: torch.Tensor | None = None
+    confidence: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         ranges = real_tensor("ranges", self.ranges).float()
@@ -49,25 +62,31 @@ class Scan:
                 "store 0 where nothing came back"
             )
         object.__setattr__(self, "ranges", ranges)
-        if self.intensity is None:
-            return
-        intensity = real_tensor("intensity", self.intensity).to(ranges)
-        if intensity.shape != ranges.shape:
+        for name, remedy in OF_RETURNS.items():
+            object.__setattr__(self, name, self._of_returns(name, remedy))
+
+    def _of_returns(self, name: str, remedy: str) -> torch.Tensor | None:
+        """Returns a checked tensor of values from 0 to 1 as it is stored; None if the scan has none."""
+        if getattr(self, name) is None:
+            return None
+        values = real_tensor(name, getattr(self, name)).to(self.ranges)
+        if values.shape != self.ranges.shape:
             raise ValueError(
-                f"intensity has shape {tuple(intensity.shape)}; it should be {tuple(ranges.shape)}, as ranges"
+                f"{name} has shape {tuple(values.shape)}; it should be {tuple(self.ranges.shape)}, as ranges"
             )
-        outside = ~((intensity >= 0) & (intensity <= 1))  # NaN too
+        outside = ~((values >= 0) & (values <= 1))  # NaN too
         if outside.any():
-            raise ValueError(
-                f"intensity has {int(outside.sum())} of {outside.numel()} values outside 0 to 1; "
-                "divide it by the largest that the sensor reports"
-            )
-        object.__setattr__(self, "intensity", intensity.where(ranges > 0, 0.0))
+            raise ValueError(f"{name} has {int(outside.sum())} of {outside.numel()} values outside 0 to 1; {remedy}")
+        return values.where(self.ranges > 0, 0.0)
+
+    def _map(self, change: Callable[[torch.Tensor], torch.Tensor], sensor: Sensor) -> "Scan":
+        """Returns a scan of `sensor`, with each tensor changed."""
+        others = (getattr(self, name) for name in OF_RETURNS)
+        return Scan(change(self.ranges), sensor, *(None if other is None else change(other) for other in others))
 
     def to(self, device: torch.device | str) -> "Scan":
-        """Returns the scan, with its intensity, on a device."""
-        intensity = None if self.intensity is None else self.intensity.to(device)
-        return Scan(self.ranges.to(device), self.sensor, intensity)
+        """Returns the scan, with its intensity and confidence, on a device."""
+        return self._map(lambda image: image.to(device), self.sensor)
 
     def points(self) -> torch.Tensor:
         """Returns the points of all returns, (N, 3) float32 [m], in the sensor frame, row by row."""
@@ -88,11 +107,31 @@ class Scan:
         """Returns the scan of only some beams and columns; see `Sensor.decimation`."""
         indices = self.sensor.decimation(rows, columns)
         row_index, column_index = (torch.from_numpy(index).to(self.ranges.device) for index in indices)
-        intensity = None if self.intensity is None else self.intensity[row_index][:, column_index]
-        return Scan(self.ranges[row_index][:, column_index], self.sensor.decimate(rows, columns), intensity)
+        return self._map(lambda image: image[row_index][:, column_index], self.sensor.decimate(rows, columns))
+
+    def confident(self, least: float) -> "Scan":
+        """Returns the scan of only those returns that are right with at least this probability; no return elsewhere.
+
+        Args:
+            least: The least confidence, from 0 to 1.
+
+        Raises:
+            ValueError: If it is not from 0 to 1, or the scan has no confidence.
+        """
+        if not 0 <= least <= 1:
+            raise ValueError(f"least is {least}; it should be from 0 to 1, a probability")
+        if self.confidence is None:
+            raise ValueError("the scan has no confidence; it should be one that a model with confidence predicted")
+        return replace(self, ranges=self.ranges.where(self.confidence >= least, 0.0))
 
     @classmethod
-    def from_points(cls, points: torch.Tensor | np.ndarray, sensor: Sensor) -> "Scan":
+    def from_points(
+        cls,
+        points: torch.Tensor | np.ndarray,
+        sensor: Sensor,
+        intensity: torch.Tensor | np.ndarray | None = None,
+        confidence: torch.Tensor | np.ndarray | None = None,
+    ) -> "Scan":
         """Returns the range image of a point cloud.
 
         Each point goes to its nearest pixel. Of several points in one pixel, the nearest to the sensor stays. Points
@@ -101,31 +140,50 @@ class Scan:
         Args:
             points: (N, 3 or more) [m], in the sensor frame; columns after x, y, z are ignored.
             sensor: The sensor that measured them.
+            intensity: (N,) strength of each point, from 0 to 1.
+            confidence: (N,) probability of each point that it is right to 10 cm.
 
         Raises:
-            ValueError: If `points` has another shape, or no point is in view.
+            ValueError: If an argument has another shape, no point is in view, or a point in view has an intensity or
+                confidence that is not in [0, 1].
         """
         points = real_tensor("points", points)
         if points.ndim != 2 or points.shape[1] < 3:
             raise ValueError(f"points has shape {tuple(points.shape)}; it should be (N, 3 or more)")
+        of_points: dict[str, torch.Tensor] = {}
+        for name, values in (("intensity", intensity), ("confidence", confidence)):
+            if values is not None:
+                of_points[name] = real_tensor(name, values).to(points.device, torch.float32)
+                if of_points[name].shape != points.shape[:1]:
+                    raise ValueError(
+                        f"{name} has shape {tuple(of_points[name].shape)}; it should be ({len(points)},), as points"
+                    )
         xyz = points[:, :3].double()
         distance = xyz.norm(dim=1)
-        usable = distance.isfinite() & (distance > 0)
-        xyz, distance = xyz[usable], distance[usable]
-        pixels = sensor.locate(*directions_to_angles(xyz))
+        usable = (distance.isfinite() & (distance > 0)).nonzero().squeeze(1)
+        pixels = sensor.locate(*directions_to_angles(xyz[usable]))
         in_view = sensor.contains(pixels)
         if not in_view.any():
             raise ValueError(
-                f"none of {len(points)} points ({len(distance)} finite and off the origin) is in view of {sensor}: "
+                f"none of {len(points)} points ({len(usable)} finite and off the origin) is in view of {sensor}: "
                 "give the sensor that measured them, and points in metres in its frame"
             )
+        kept = usable[in_view]
         height, width = sensor.shape
         row, column = pixels[in_view].round().long().unbind(-1)
         row = row.clamp(0, height - 1)
         column = column.remainder(width) if sensor.wrap else column.clamp(0, width - 1)
+        pixel, distance = row * width + column, distance[kept].float()
         ranges = torch.full((height * width,), torch.inf, device=points.device)
-        ranges.scatter_reduce_(0, row * width + column, distance[in_view].float(), "amin")
-        return cls(ranges.masked_fill(ranges.isinf(), 0.0).view(height, width), sensor)
+        ranges.scatter_reduce_(0, pixel, distance, "amin")
+        stays = distance == ranges[pixel]  # of equally near points, the one with the larger value
+        images = {
+            name: torch.zeros_like(ranges)
+            .scatter_reduce_(0, pixel[stays], values[kept][stays], "amax", include_self=False)
+            .view(sensor.shape)
+            for name, values in of_points.items()
+        }
+        return cls(ranges.masked_fill(ranges.isinf(), 0.0).view(sensor.shape), sensor, **images)
 
 
 # The scan that a model sees, and the scan that it should predict.
