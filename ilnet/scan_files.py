@@ -5,26 +5,30 @@ A range of 0 means no return. Points are in the sensor frame, see `ilnet.sensor`
 `read` goes by the suffix:
 
 - `.npz`: `range` (H, W) [m], `elevation_deg` (H,) of the rows and `column_azimuth_deg` (W,) of the columns. Optional
-  are `min_range`, `max_range` and `norm_range` [m], by default the paper's 2, 80 and 100; `name`; and `intensity`
-  (H, W), 0 to 1. A sensor given to `read` replaces all of these except range and intensity.
+  are `min_range`, `max_range` and `norm_range` [m], by default the paper's 2, 80 and 100; `name`; and `intensity` and
+  `confidence` (H, W). A sensor given to `read` replaces all of these except range, intensity and confidence.
 - `.npy`: ranges (H, W) of the sensor's shape, or points (N, 3) to (N, 8) that start with x, y, z. Needs a sensor.
 - `.bin`: KITTI's float32 x, y, z, intensity. The sensor is `hdl-64e` by default.
-- `.ply`: vertices with x, y, z; ascii or binary. Needs a sensor.
-- `.pcd`: points with x, y, z; ascii, binary or binary_compressed. Needs a sensor; VIEWPOINT is not applied.
+- `.ply`: vertices with x, y, z, and perhaps `intensity` and `confidence`; ascii or binary. Needs a sensor.
+- `.pcd`: points with x, y, z, and perhaps `intensity` and `confidence`; ascii, binary or binary_compressed. Needs a
+  sensor; VIEWPOINT is not applied.
 
-`write` makes `.npz`, `.ply` and `.pcd`. Intensity is written to all of them, and read from `.npz` alone.
+An intensity beyond 1 is divided by 255; beyond 255, by 65535; and beyond that, by the largest in the file.
+
+`write` makes `.npz`, `.ply` and `.pcd`, with intensity and confidence where the scan has them.
 """
 
 import os
 import secrets
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import torch
 
-from ilnet.scan import Scan, real_tensor
+from ilnet.scan import OF_RETURNS, Scan, real_tensor
 from ilnet.sensor import Sensor, preset
 
 __all__ = ["UnknownSensor", "listed", "read", "write"]
@@ -84,7 +88,7 @@ def write(path: str | Path, scan: Scan) -> None:
 
     Args:
         path: The file; its suffix says the format.
-        scan: What is written, with its intensity where it has one.
+        scan: What is written, with its intensity and confidence where it has them.
 
     Raises:
         ValueError: If the suffix is unknown.
@@ -113,7 +117,7 @@ def _read_npz(path: Path, sensor: Sensor | None) -> Scan:
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             found = list(file.files)
-            wanted = ("range", "elevation_deg", "column_azimuth_deg", "intensity", *limits)
+            wanted = ("range", "elevation_deg", "column_azimuth_deg", *OF_RETURNS, *limits)
             arrays = {key: file[key] for key in wanted if key in found}
     except Exception as error:  # zipfile, zlib and numpy raise many kinds on damaged archives
         raise ValueError(f"it cannot be unpacked: {error}") from error
@@ -125,8 +129,7 @@ def _read_npz(path: Path, sensor: Sensor | None) -> Scan:
     if sensor is None:
         elevations, azimuths = (real_tensor(key, arrays[key]).double().deg2rad().numpy() for key in needed[1:])
         sensor = Sensor(elevations, azimuths, **{key: arrays[key] for key in limits if key in arrays})
-    intensity = real_tensor("intensity", arrays["intensity"]) if "intensity" in arrays else None
-    return Scan(real_tensor("range", arrays["range"]), sensor, intensity)
+    return Scan(real_tensor("range", arrays["range"]), sensor, **_of_returns(arrays))
 
 
 def _read_npy(path: Path, sensor: Sensor | None) -> Scan:
@@ -147,9 +150,13 @@ def _read_bin(path: Path, sensor: Sensor | None) -> Scan:
     data = path.read_bytes()
     if not data or len(data) % 16:
         raise ValueError(f"its {len(data)} bytes are not whole KITTI points of 16 bytes (float32 x, y, z, intensity)")
-    return Scan.from_points(np.frombuffer(data, "<f4").reshape(-1, 4), sensor or preset("hdl-64e"))
+    points = np.frombuffer(data, "<f4").reshape(-1, 4)
+    return _from_columns(dict(zip((*_XYZ, "intensity"), points.T, strict=True)), sensor or preset("hdl-64e"))
 
 
+_XYZ = ("x", "y", "z")
+# The intensity of a perfect reflector: as a share, in 8 bits, in 16 bits.
+_WHOLES = (1.0, 255.0, 65535.0)
 # A field of a point: its name, its numpy type, its number of values.
 _Field = tuple[str, np.dtype, int]
 
@@ -181,7 +188,7 @@ def _read_ply(path: Path, sensor: Sensor | None) -> Scan:
     if elements[:1] != ["vertex"]:
         raise ValueError(f"its elements are {', '.join(elements) or 'none'}; the first should be its vertices")
     unpack = _from_text if layout == "ascii" else _from_records
-    return Scan.from_points(unpack(body, fields, count), sensor)
+    return _from_columns(unpack(body, fields, count), sensor)
 
 
 def _read_pcd(path: Path, sensor: Sensor | None) -> Scan:
@@ -205,7 +212,7 @@ def _read_pcd(path: Path, sensor: Sensor | None) -> Scan:
     layout = " ".join(header["DATA"])
     if layout not in unpackers:
         raise ValueError(f"its DATA is {layout!r}; it should be one of {', '.join(unpackers)}")
-    return Scan.from_points(unpackers[layout](body, fields, count), sensor)
+    return _from_columns(unpackers[layout](body, fields, count), sensor)
 
 
 class UnknownSensor(ValueError):
@@ -232,12 +239,29 @@ def _header(file: BinaryIO, last: str) -> list[list[str]]:
     raise ValueError(f"its header has no line {last!r}: it was cut short or is of another kind")
 
 
-def _xyz(fields: list[_Field]) -> list[int]:
-    """Returns the numbers of the fields x, y and z."""
+def _of_returns(arrays: Mapping[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    """Returns intensity and confidence as a scan takes them, as far as a file has them."""
+    found = {name: real_tensor(name, arrays[name]) for name in OF_RETURNS if name in arrays}
+    if "intensity" in found:
+        intensity = found["intensity"]
+        largest = intensity.where(intensity.isfinite(), 0.0).max().item() if intensity.numel() else 0.0
+        found["intensity"] = intensity / next((whole for whole in _WHOLES if largest <= whole), largest)
+    return found
+
+
+def _from_columns(columns: Mapping[str, np.ndarray], sensor: Sensor) -> Scan:
+    """Returns the scan of points whose fields are given, each (N,)."""
+    with np.errstate(invalid="ignore"):  # no warning about a signalling NaN: such points are dropped
+        points = np.stack([columns[axis] for axis in _XYZ], axis=1, dtype=np.float64)
+    return Scan.from_points(points, sensor, **_of_returns(columns))
+
+
+def _numbers(fields: list[_Field]) -> dict[str, int]:
+    """Returns the numbers of the fields that are read: x, y and z, and what else a scan keeps."""
     names = [name for name, _, _ in fields]
-    if not {"x", "y", "z"} <= set(names):
+    if not {*_XYZ} <= set(names):
         raise ValueError(f"its fields are {', '.join(names) or 'none'}; x, y and z should be among them")
-    return [names.index(axis) for axis in "xyz"]
+    return {name: names.index(name) for name in (*_XYZ, *OF_RETURNS) if name in names}
 
 
 def _check_size(body: bytes, need: int, count: int) -> None:
@@ -247,25 +271,27 @@ def _check_size(body: bytes, need: int, count: int) -> None:
         raise ValueError(f"it was cut short: {count} points take {need} bytes, {len(body)} are there")
 
 
-def _from_text(body: bytes, fields: list[_Field], count: int) -> np.ndarray:
+def _from_text(body: bytes, fields: list[_Field], count: int) -> dict[str, np.ndarray]:
     _check_size(body, 0, count)
     starts = np.cumsum([0, *(size for _, _, size in fields)])
     lines = [line for line in body.decode("ascii", "replace").splitlines() if line.strip()]
     if len(lines) < count:
         raise ValueError(f"it was cut short: its header promises {count} points, {len(lines)} are there")
-    return np.loadtxt(lines[:count], usecols=[starts[i] for i in _xyz(fields)], ndmin=2)
+    numbers = _numbers(fields)
+    columns = np.loadtxt(lines[:count], usecols=[starts[i] for i in numbers.values()], ndmin=2)
+    return dict(zip(numbers, columns.T, strict=True))
 
 
-def _from_records(body: bytes, fields: list[_Field], count: int) -> np.ndarray:
+def _from_records(body: bytes, fields: list[_Field], count: int) -> dict[str, np.ndarray]:
     """Unpacks points stored one after the other."""
     # Numbered, since names may repeat: PCL pads with fields that are all called "_".
     record = np.dtype([(str(i), kind, (size,)) for i, (_, kind, size) in enumerate(fields)])
     _check_size(body, count * record.itemsize, count)
     records = np.frombuffer(body, record, count)
-    return _stack([records[str(i)][:, 0] for i in _xyz(fields)])
+    return {name: records[str(i)][:, 0] for name, i in _numbers(fields).items()}
 
 
-def _from_compressed(body: bytes, fields: list[_Field], count: int) -> np.ndarray:
+def _from_compressed(body: bytes, fields: list[_Field], count: int) -> dict[str, np.ndarray]:
     """Unpacks PCD's binary_compressed: two sizes, then LZF of all x, all y, and so on."""
     packed, unpacked = int.from_bytes(body[:4], "little"), int.from_bytes(body[4:8], "little")
     _check_size(body[8:], packed, count)
@@ -274,13 +300,10 @@ def _from_compressed(body: bytes, fields: list[_Field], count: int) -> np.ndarra
         raise ValueError(f"its {count} points take {sum(sizes)} bytes, but its data says {unpacked}")
     data = _lzf(body[8 : 8 + packed], unpacked)
     starts = np.cumsum([0, *sizes])
-    columns = [np.frombuffer(data, fields[i][1], count * fields[i][2], starts[i]) for i in _xyz(fields)]
-    return _stack([column.reshape(count, -1)[:, 0] for column in columns])
-
-
-def _stack(columns: list[np.ndarray]) -> np.ndarray:
-    with np.errstate(invalid="ignore"):  # no warning about a signalling NaN: such points are dropped
-        return np.stack(columns, axis=1, dtype=np.float64)
+    return {
+        name: np.frombuffer(data, fields[i][1], count * fields[i][2], starts[i]).reshape(count, -1)[:, 0]
+        for name, i in _numbers(fields).items()
+    }
 
 
 def _lzf(data: bytes, size: int) -> bytes:
@@ -321,28 +344,32 @@ def _write_npz(file: BinaryIO, scan: Scan) -> None:
         norm_range=np.array(sensor.norm_range),
         name=np.array(sensor.name),
     )
-    if scan.intensity is not None:
-        arrays["intensity"] = scan.intensity.cpu().numpy()
+    arrays |= {name: image.cpu().numpy() for name, image in _images(scan).items()}
     np.savez_compressed(file, **arrays)
 
 
-def _point_rows(scan: Scan, **images: torch.Tensor | None) -> tuple[list[str], np.ndarray]:
-    """Returns the names of a point's fields, and the points (N, fields): x, y, z and their values in `images`."""
-    known = {name: image for name, image in images.items() if image is not None}
+def _images(scan: Scan) -> dict[str, torch.Tensor]:
+    """Returns intensity and confidence, as far as the scan has them."""
+    return {name: image for name in OF_RETURNS if (image := getattr(scan, name)) is not None}
+
+
+def _point_rows(scan: Scan, **images: torch.Tensor) -> tuple[list[str], np.ndarray]:
+    """Returns the names of a point's fields, and the points (N, fields): x, y, z, `images`, and what the scan keeps."""
+    images |= _images(scan)
     measured = scan.ranges > 0
-    rows = torch.cat((scan.points(), *(image[measured, None] for image in known.values())), dim=1)
-    return ["x", "y", "z", *known], rows.cpu().numpy().astype("<f4")
+    rows = torch.cat((scan.points(), *(image[measured, None] for image in images.values())), dim=1)
+    return [*_XYZ, *images], rows.cpu().numpy().astype("<f4")
 
 
 def _write_ply(file: BinaryIO, scan: Scan) -> None:
-    fields, rows = _point_rows(scan, range=scan.ranges, intensity=scan.intensity)
+    fields, rows = _point_rows(scan, range=scan.ranges)
     properties = "".join(f"property float {name}\n" for name in fields)
     file.write(f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n".encode())
     file.write(rows.tobytes())
 
 
 def _write_pcd(file: BinaryIO, scan: Scan) -> None:
-    fields, rows = _point_rows(scan, intensity=scan.intensity)
+    fields, rows = _point_rows(scan)
     sizes, types, counts = (" ".join(entry * len(fields)) for entry in ("4", "F", "1"))
     file.write(
         "# .PCD v0.7 - Point Cloud Data file format\n"
