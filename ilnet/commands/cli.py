@@ -282,6 +282,12 @@ def _json(value: Any) -> str:
     type=click.Choice(["npz", "ply", "pcd"]),
     help="Format of the files in a folder OUT; npz by default.",
 )
+@click.option(
+    "--min-confidence",
+    type=float,
+    metavar="P",
+    help="Drop returns that are right to 10 cm with a probability below P, 0 to 1, by a model that tells it.",
+)
 @click.pass_context
 def upsample(
     context: click.Context,
@@ -292,6 +298,7 @@ def upsample(
     name: str,
     origin: str | None,
     suffix: str | None,
+    min_confidence: float | None,
 ) -> None:
     """Make a denser scan of the file IN, or of each file in the folder IN."""
     if bool(size) == bool(sensor):
@@ -304,7 +311,8 @@ def upsample(
 
     target = size or preset(str(sensor))
     sensors = target, preset(origin) if origin else None
-    written, failed = upsample.run(source, out, models.load(name), *sensors, f".{suffix or 'npz'}")
+    model, ending = models.load(name), f".{suffix or 'npz'}"
+    written, failed = upsample.run(source, out, model, *sensors, ending, min_confidence)
     if written:
         click.echo(f"{written} scan(s) written to {out}" + (f", {failed} could not be: see above" if failed else ""))
     if failed:

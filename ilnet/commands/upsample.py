@@ -20,6 +20,7 @@ def run(
     target: Sensor | tuple[int, int],
     sensor: Sensor | None = None,
     suffix: str = ".npz",
+    min_confidence: float | None = None,
 ) -> tuple[int, int]:
     """Upsamples a file, or all files of a folder, with a progress bar on stderr.
 
@@ -35,14 +36,20 @@ def run(
         target: The sensor whose scan is wanted, or rows and columns over the field of view of each file's sensor.
         sensor: The sensor of the files, if they do not hold its angles; see `ilnet.scan_files.read`.
         suffix: Suffix of the files written to a folder.
+        min_confidence: Returns of less confidence become no return; None keeps all.
 
     Returns:
         The numbers of files that were written and that could not be.
 
     Raises:
         OSError: If `source` is missing or `out` cannot be made.
-        ValueError: If there is nothing to upsample, or it would be overwritten.
+        ValueError: If there is nothing to upsample, it would be overwritten, `min_confidence` is no probability, or the
+            model tells no confidence to compare with it.
     """
+    if min_confidence is not None and not 0 <= min_confidence <= 1:
+        raise ValueError(f"--min-confidence is {min_confidence}; it should be from 0 to 1")
+    if min_confidence is not None and not model.tells_confidence:
+        raise ValueError("--min-confidence needs a model that tells its confidence, such as --model iln-surfaces")
     device = simulate.best_device()
     model = model.to(device)
     frames: models.Upsampler | None = None
@@ -57,7 +64,8 @@ def run(
             if frames is None or frames.source != scan.sensor:
                 wanted = target if isinstance(target, Sensor) else scan.sensor.resize(*target)
                 frames = models.Upsampler(model, scan.sensor, wanted, device=device)
-            scan_files.write(result, frames(scan))
+            dense = frames(scan)
+            scan_files.write(result, dense if min_confidence is None else dense.confident(min_confidence))
             written.add(result)
         except (ValueError, OSError) as error:
             failed += 1

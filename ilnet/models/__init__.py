@@ -9,7 +9,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
 from ilnet.models import authors
-from ilnet.models.base import PRECISIONS, Model, Upsampler, returns
+from ilnet.models.base import PRECISIONS, Answer, Model, Upsampler, returns
 from ilnet.models.bilinear import Bilinear, Nearest, Planes
 from ilnet.models.iln import ILN
 from ilnet.models.lidar_sr import LiDARSR
@@ -22,6 +22,7 @@ __all__ = [
     "NAMES",
     "PRECISIONS",
     "TRAINABLE",
+    "Answer",
     "Bilinear",
     "LiDARSR",
     "Model",

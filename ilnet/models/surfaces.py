@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from ilnet.models.base import OFFSET_SCALE, Model
+from ilnet.models.base import OFFSET_SCALE, Answer, Model
 from ilnet.models.encoder import Encoder
 from ilnet.models.iln import Block
 from ilnet.sensor import Sensor
@@ -95,6 +95,8 @@ class Surfaces(Model):
     Source: ours; `kernels.surfaces` has the equations.
     """
 
+    tells_confidence = True
+
     def __init__(self, features: int = 48, blocks: int = 8, tokens: int = 32, heads: int = 8, weight: float = 1.0):
         if heads < 1 or tokens % heads:
             raise ValueError(f"heads is {heads}; it should divide the {tokens} tokens")
@@ -138,10 +140,14 @@ class Surfaces(Model):
 
     def decode(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Returns the weighted medians (B, Q) [m] of the hypotheses; the sensor's `norm_range` means no return."""
+        return self.answer(encoded, image, queries, wrap).ranges
+
+    def answer(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> Answer:
+        """Returns what `decode` returns, and how likely the surface of each neighbour is met there."""
         scores, scales = self.scores(encoded, queries, wrap)
         angles = encoded.sensor.angles(image.device)
-        ranges, _, _ = surface_median(encoded.measured, queries, *angles, scores, scales, wrap, self.backend)
-        return ranges.where(ranges > 0, encoded.sensor.norm_range)
+        ranges, support, _ = surface_median(encoded.measured, queries, *angles, scores, scales, wrap, self.backend)
+        return Answer(ranges.where(ranges > 0, encoded.sensor.norm_range), support, support.sum(-1))
 
     def loss(
         self,
