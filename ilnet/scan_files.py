@@ -253,7 +253,7 @@ def _from_columns(columns: Mapping[str, np.ndarray], sensor: Sensor) -> Scan:
     """Returns the scan of points whose fields are given, each (N,)."""
     with np.errstate(invalid="ignore"):  # no warning about a signalling NaN: such points are dropped
         points = np.stack([columns[axis] for axis in _XYZ], axis=1, dtype=np.float64)
-    return Scan.from_points(points, sensor, **_of_returns(columns))
+        return Scan.from_points(points, sensor, **_of_returns(columns))
 
 
 def _numbers(fields: list[_Field]) -> dict[str, int]:

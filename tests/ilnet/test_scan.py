@@ -1,4 +1,4 @@
-"""Scans: range images, points and intensity."""
+"""Scans: range images, points, intensity and confidence."""
 
 import math
 
@@ -9,7 +9,7 @@ import torch
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
 
-from .toy import ROUND_TRIP, SENSOR, bright, toy
+from .toy import ROUND_TRIP, SENSOR, bright, predicted, toy
 
 
 def test_points_by_hand():
@@ -62,46 +62,68 @@ def test_bad_ranges(ranges, message):
         Scan(ranges, SENSOR)
 
 
-# Intensity
+# Intensity and confidence
 
 
-def test_intensity_is_zero_where_nothing_returned():
+def test_intensity_and_confidence_are_zero_where_nothing_returned():
     assert toy().intensity is None
-    found = bright().intensity
-    assert found.dtype == torch.float32
-    assert found[0, 1] == found[3, 3] == 0
-    assert found[2, 2] == pytest.approx(10 / 15)
+    assert toy().confidence is None
+    assert bright().confidence is None
+    found = predicted()
+    assert found.intensity.dtype == found.confidence.dtype == torch.float32
+    assert found.intensity[0, 1] == found.intensity[3, 3] == found.confidence[0, 1] == found.confidence[3, 3] == 0
+    assert found.intensity[2, 2] == pytest.approx(10 / 15)
+    assert found.confidence[2, 2] == pytest.approx(0.5)
 
 
-def test_decimate_keeps_the_intensity_of_each_pixel():
-    few = bright().decimate(3, 2)
-    assert torch.equal(few.intensity, bright().intensity[[0, 2, 3]][:, [0, 2]])
+def test_decimate_keeps_intensity_and_confidence_of_each_pixel():
+    few = predicted().decimate(3, 2)
+    assert torch.equal(few.intensity, predicted().intensity[[0, 2, 3]][:, [0, 2]])
+    assert torch.equal(few.confidence, predicted().confidence[[0, 2, 3]][:, [0, 2]])
+    assert bright().decimate(3, 2).confidence is None
 
 
+@pytest.mark.parametrize("name", ["intensity", "confidence"])
 @pytest.mark.parametrize(
-    ("intensity", "message"),
+    ("values", "message"),
     [
-        (torch.zeros(4, 5), r"intensity has shape \(4, 5\); it should be \(4, 4\)"),
-        (np.full((4, 4), 255, np.uint8), "intensity has 16 of 16 values outside 0 to 1; divide"),
-        (torch.tensor([math.nan, -0.1, 0, 1] * 4).view(4, 4), "intensity has 8 of 16 values outside"),
+        (torch.zeros(4, 5), r" has shape \(4, 5\); it should be \(4, 4\)"),
+        (np.full((4, 4), 255, np.uint8), " has 16 of 16 values outside 0 to 1; (divide it|they should be prob)"),
+        (torch.tensor([math.nan, -0.1, 0, 1] * 4).view(4, 4), " has 8 of 16 values outside"),
     ],
 )
-def test_bad_intensity(intensity, message):
-    with pytest.raises(ValueError, match=message):
-        Scan(toy().ranges, SENSOR, intensity)
+def test_bad_intensity_and_confidence(name, values, message):
+    with pytest.raises(ValueError, match=name + message):
+        Scan(toy().ranges, SENSOR, **{name: values})
 
 
-def test_a_scan_moves_to_a_device_with_its_intensity(device):
-    found = bright().to(device)
-    assert found.ranges.device.type == found.intensity.device.type == device.type
-    assert torch.equal(found.ranges.cpu(), bright().ranges)
-    assert torch.equal(found.intensity.cpu(), bright().intensity)
-    assert found.sensor is bright().sensor
+def test_a_scan_moves_to_a_device_with_all_it_has(device):
+    found = predicted().to(device)
+    for name in ("ranges", "intensity", "confidence"):
+        assert getattr(found, name).device.type == device.type
+        assert torch.equal(getattr(found, name).cpu(), getattr(predicted(), name))
+    assert found.sensor is predicted().sensor
     assert toy().to(device).intensity is None
 
 
 def test_a_scan_is_decimated_where_it_is(device):
-    assert bright().to(device).decimate(3, 2).intensity.device.type == device.type
+    few = predicted().to(device).decimate(3, 2)
+    assert few.intensity.device.type == few.confidence.device.type == device.type
+
+
+def test_only_confident_returns_stay():
+    scan = predicted()
+    found = scan.confident(0.5)
+    stays = (scan.confidence >= 0.5) & (scan.ranges > 0)
+    assert stays.sum() == 10  # of the first 11 pixels, one has no return
+    for name in ("ranges", "intensity", "confidence"):
+        assert torch.equal(getattr(found, name), getattr(scan, name).where(stays, 0.0))
+    assert torch.equal(scan.confident(0).ranges, scan.ranges)
+    for least in (-0.1, 1.1, math.nan):
+        with pytest.raises(ValueError, match=f"least is {least}; it should be from 0 to 1"):
+            scan.confident(least)
+    with pytest.raises(ValueError, match="the scan has no confidence"):
+        bright().confident(0.5)
 
 
 # Points to a range image
@@ -117,6 +139,25 @@ def test_nearest_return_wins_and_useless_points_go():
     expected[1, 3] = 4
     torch.testing.assert_close(found.ranges, expected, **ROUND_TRIP)
     assert found.sensor is SENSOR
+
+
+def test_points_bring_their_intensity_and_confidence(device):
+    scan = predicted()
+    # Behind each point another one of value 1, and one that is no point and has no value.
+    points = torch.cat((scan.points(), 1.5 * scan.points(), torch.full((1, 3), math.nan)))
+    more = torch.cat((torch.ones(14), torch.tensor([300.0])))
+    intensity, confidence = (torch.cat((of[scan.ranges > 0], more)) for of in (scan.intensity, scan.confidence))
+    order = torch.randperm(29, generator=torch.Generator().manual_seed(0))
+    found = Scan.from_points(points[order].to(device), SENSOR, intensity[order], confidence[order].numpy())
+    assert torch.equal(found.ranges > 0, (scan.ranges > 0).to(device))
+    for name in ("intensity", "confidence"):
+        assert torch.equal(getattr(found, name), getattr(scan, name).to(device))
+    assert Scan.from_points(points, SENSOR, confidence=confidence).intensity is None
+    with pytest.raises(ValueError, match=r"intensity has shape \(28,\); it should be \(29,\), as points"):
+        Scan.from_points(points, SENSOR, intensity[1:])
+    intensity[3] = -0.5
+    with pytest.raises(ValueError, match="intensity has 1 of 16 values outside 0 to 1"):
+        Scan.from_points(points, SENSOR, intensity)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from ilnet.scan import Scan
 from ilnet.scan_files import read, write
 from ilnet.sensor import Sensor, preset
 
-from .toy import ROUND_TRIP, SENSOR, bright, toy
+from .toy import ROUND_TRIP, SENSOR, bright, predicted, toy
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "scans"
 REAL = [
@@ -24,22 +24,51 @@ REAL = [
 ]
 
 
-def test_files_keep_the_intensity(tmp_path):
-    write(tmp_path / "a.npz", bright())
-    assert torch.equal(read(tmp_path / "a.npz").intensity, bright().intensity)
-    write(tmp_path / "plain.npz", toy())
-    assert read(tmp_path / "plain.npz").intensity is None
+# Intensity and confidence
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.ply", "a.pcd"])
+@pytest.mark.parametrize("make", [toy, bright, predicted])
+def test_files_keep_intensity_and_confidence(tmp_path, name, make):
+    scan = make()
+    write(tmp_path / name, scan)
+    found = read(tmp_path / name, None if name == "a.npz" else SENSOR)
+    torch.testing.assert_close(found.ranges, scan.ranges, **ROUND_TRIP)
+    for of in ("intensity", "confidence"):
+        expected = getattr(scan, of)
+        assert getattr(found, of) is None if expected is None else torch.equal(getattr(found, of), expected)
+
+
+def test_points_in_files_have_fields_that_others_know(tmp_path):
     for name, end, field in (
-        ("a.ply", b"end_header\n", b"property float range\nproperty float intensity\n"),
-        ("a.pcd", b"DATA binary\n", b"FIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"),
+        (
+            "a.ply",
+            b"end_header\n",
+            b"property float range\nproperty float intensity\nproperty float confidence\n",
+        ),
+        (
+            "a.pcd",
+            b"DATA binary\n",
+            b"FIELDS x y z intensity confidence\nSIZE 4 4 4 4 4\nTYPE F F F F F\nCOUNT 1 1 1 1 1\n",
+        ),
     ):
-        write(tmp_path / name, bright())
+        write(tmp_path / name, predicted())
         header, body = (tmp_path / name).read_bytes().split(end)
         assert field in header
         points = np.frombuffer(body, "<f4").reshape(14, -1)
-        np.testing.assert_array_equal(points[:, :3], bright().points())
-        np.testing.assert_array_equal(points[:, -1], bright().intensity[bright().ranges > 0])
-        torch.testing.assert_close(read(tmp_path / name, SENSOR).ranges, toy().ranges, **ROUND_TRIP)
+        np.testing.assert_array_equal(points[:, :3], predicted().points())
+        np.testing.assert_array_equal(points[:, -2], predicted().intensity[predicted().ranges > 0])
+        np.testing.assert_array_equal(points[:, -1], predicted().confidence[predicted().ranges > 0])
+
+
+@pytest.mark.parametrize(("whole", "kind"), [(255, np.uint8), (65535, np.uint16), (255, ">f4"), (7e5, np.float64)])
+def test_an_intensity_of_any_scale_becomes_a_share(tmp_path, whole, kind):
+    intensity = (bright().intensity.double() * whole).round().numpy().astype(kind)
+    intensity[2, 3] = whole
+    np.savez(tmp_path / "a.npz", range=toy().ranges.numpy(), intensity=intensity)
+    found = read(tmp_path / "a.npz", SENSOR).intensity
+    torch.testing.assert_close(found[:2], bright().intensity[:2], rtol=0, atol=0.5 / whole)
+    assert found.max() == 1
 
 
 # Files: there and back
@@ -147,6 +176,8 @@ def test_kitti(tmp_path):
     found = read(tmp_path / "a.bin")
     assert found.sensor == sensor
     torch.testing.assert_close(found.ranges, ranges, **ROUND_TRIP)
+    assert found.intensity[5, 100].item() == pytest.approx(0.2)
+    assert found.intensity[60, 2000].item() == pytest.approx(0.9)
     assert read(tmp_path / "a.bin", preset("paper-16x1024")).sensor == preset("paper-16x1024")
 
 
@@ -159,16 +190,18 @@ def pcd(fields: str, sizes: str, types: str, counts: str | None, points: int, da
 
 
 def test_pcd_ascii(tmp_path):
-    rows = "".join(f"1 2 {z!r} 77 {x!r} {y!r}\n" for x, y, z in toy().points().tolist())
+    rows = "".join(f"1 2 {z!r} 51 {x!r} {y!r}\n" for x, y, z in toy().points().tolist())
     body = f"1 2 nan 77 nan nan\n{rows}".encode()
-    count = len(toy().points()) + 1
-    (tmp_path / "a.pcd").write_bytes(pcd("n z i x y", "4 4 4 4 4", "F F U F F", "2 1 1 1 1", count, "ascii", body))
-    torch.testing.assert_close(read(tmp_path / "a.pcd", SENSOR).ranges, toy().ranges, **ROUND_TRIP)
+    count, fields = len(toy().points()) + 1, "n z intensity x y"
+    (tmp_path / "a.pcd").write_bytes(pcd(fields, "4 4 4 4 4", "F F U F F", "2 1 1 1 1", count, "ascii", body))
+    found = read(tmp_path / "a.pcd", SENSOR)
+    torch.testing.assert_close(found.ranges, toy().ranges, **ROUND_TRIP)
+    torch.testing.assert_close(found.intensity, (toy().ranges > 0) * 0.2)
 
 
 # x, y and z out of order, of three widths, among padding that PCL names "_" more than once.
-PCD_FIELDS = ("_ z ring _ x y", "1 8 2 1 4 4", "U F U U F F", "4 1 1 3 1 1")
-PCD_RECORD = np.dtype([("p", "u1", 4), ("z", "<f8"), ("ring", "<u2"), ("q", "u1", 3), ("x", "<f4"), ("y", "<f4")])
+PCD_FIELDS = ("_ z intensity _ x y", "1 8 2 1 4 4", "U F U U F F", "4 1 1 3 1 1")
+PCD_RECORD = np.dtype([("p", "u1", 4), ("z", "<f8"), ("i", "<u2"), ("q", "u1", 3), ("x", "<f4"), ("y", "<f4")])
 
 
 def pcd_records() -> np.ndarray:
@@ -180,7 +213,9 @@ def pcd_records() -> np.ndarray:
 def test_pcd_binary(tmp_path):
     records = pcd_records()
     (tmp_path / "a.pcd").write_bytes(pcd(*PCD_FIELDS, len(records), "binary", records.tobytes()))
-    torch.testing.assert_close(read(tmp_path / "a.pcd", SENSOR).ranges, toy().ranges, **ROUND_TRIP)
+    found = read(tmp_path / "a.pcd", SENSOR)
+    torch.testing.assert_close(found.ranges, toy().ranges, **ROUND_TRIP)
+    torch.testing.assert_close(found.intensity, (toy().ranges > 0) * (77 / 255))
 
 
 def test_pcd_binary_compressed(tmp_path):
@@ -191,7 +226,9 @@ def test_pcd_binary_compressed(tmp_path):
     packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
     body = struct.pack("<II", len(packed), len(columns)) + packed
     (tmp_path / "a.pcd").write_bytes(pcd(*PCD_FIELDS, len(records), "binary_compressed", body))
-    torch.testing.assert_close(read(tmp_path / "a.pcd", SENSOR).ranges, toy().ranges, **ROUND_TRIP)
+    found = read(tmp_path / "a.pcd", SENSOR)
+    torch.testing.assert_close(found.ranges, toy().ranges, **ROUND_TRIP)
+    torch.testing.assert_close(found.intensity, (toy().ranges > 0) * (77 / 255))
 
 
 def test_lzf_copies():
@@ -363,7 +400,7 @@ def test_damage_anywhere_is_one_kind_of_error(tmp_path):
     rng = np.random.default_rng(3)
     for suffix in (".npz", ".ply", ".pcd"):
         path = tmp_path / f"a{suffix}"
-        write(path, toy())
+        write(path, predicted())
         whole = path.read_bytes()
         refused = 0
         for _ in range(150):

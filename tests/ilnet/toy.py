@@ -1,5 +1,7 @@
 """A small scan for tests of scans and of their files."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -22,3 +24,8 @@ def toy() -> Scan:
 def bright() -> Scan:
     """The toy with intensities 0, 1/15, ... 1, two of them where nothing returned."""
     return Scan(toy().ranges, SENSOR, torch.arange(16).view(4, 4) / 15)
+
+
+def predicted() -> Scan:
+    """The bright toy with confidences 1, 0.95, ... 0.25, two of them where nothing returned."""
+    return replace(bright(), confidence=1 - torch.arange(16).view(4, 4) / 20)

@@ -37,6 +37,13 @@ def small(prior="none", **arguments):
     return model
 
 
+def surfaces():
+    torch.manual_seed(0)
+    model = models.create("iln-surfaces", features=16, blocks=1).eval()
+    torch.nn.init.normal_(model.head[1].weight, std=0.5)
+    return model
+
+
 def draw(height=6, width=16, count=200, batch=2):
     generator = torch.Generator().manual_seed(0)
     image = torch.rand(batch, height, width, generator=generator) * 60 + 2
@@ -373,7 +380,8 @@ def graphs(monkeypatch):
         def replay(self):
             time.sleep(0.01)  # a frame is under way
             state.replays += 1
-            state.recording._answer = state.work(state.recording._image)
+            recording, work = state.recorded[self]
+            recording._frame = work(*recording._images)
 
     @contextlib.contextmanager
     def record(graph, **options):
@@ -381,11 +389,11 @@ def graphs(monkeypatch):
         if state.fails:
             raise RuntimeError("the recording failed")
 
-    def remember(recording, work, image):
-        state.recording, state.work = recording, work
-        make(recording, work, image)
+    def remember(recording, work, images):
+        make(recording, work, images)
+        state.recorded[recording._graph] = recording, work
 
-    state = types.SimpleNamespace(graphs=[], replays=0, fails=False)
+    state = types.SimpleNamespace(graphs=[], recorded={}, replays=0, fails=False)
     make = base._Recording.__init__
     nothing = types.SimpleNamespace(**{f"{verb}_event": lambda event: None for verb in ("wait", "record")})
     nothing.wait_stream = lambda stream: None
@@ -403,14 +411,14 @@ def test_a_recording_that_failed_is_made_again(graphs):
     sensor = preset("paper-16x1024").resize(8, 64)
     upsampler = models.Upsampler(models.create("bilinear"), sensor, sensor.resize(16, 64))
     images = torch.rand(4, 1, 8, 64) * 50 + 3
-    assert torch.equal(upsampler._replay(images[0]), upsampler._answer(images[0]))
+    assert torch.equal(upsampler._replay(images[0]).ranges, upsampler._answer(images[0]).ranges)
     assert graphs.graphs == []  # a single frame is not worth one
     graphs.fails = True
     with pytest.raises(RuntimeError, match="the recording failed"):
         upsampler._replay(images[1])
     graphs.fails = False
     for image in images[2:]:
-        assert torch.equal(upsampler._replay(image), upsampler._answer(image))
+        assert torch.equal(upsampler._replay(image).ranges, upsampler._answer(image).ranges)
     assert (len(graphs.graphs), graphs.replays) == (2, 2)
 
 
@@ -426,6 +434,21 @@ def test_a_first_frame_that_failed_is_no_first_frame(graphs, monkeypatch):
     assert graphs.graphs == []
 
 
+def test_frames_with_intensity_have_a_recording_of_their_own(graphs):
+    sensor = preset("paper-16x1024").resize(8, 64)
+    upsampler = models.Upsampler(surfaces(), sensor, sensor.resize(16, 64))
+    frames = torch.rand(6, 2, 1, 8, 64)
+    for number, (image, intensity) in enumerate(frames):
+        images = (image * 50 + 3, intensity) if number % 2 else (image * 50 + 3,)
+        with torch.no_grad():
+            found, expected = upsampler._replay(*images), upsampler._answer(*images)
+        assert torch.equal(found.ranges, expected.ranges)
+        assert torch.equal(found.confidence, expected.confidence)
+        assert (found.intensity is None) == (number % 2 == 0)
+        assert found.intensity is None or torch.equal(found.intensity, expected.intensity)
+    assert (len(graphs.graphs), graphs.replays) == (2, 5)
+
+
 def test_threads_that_share_an_upsampler_get_their_own_frames(graphs):
     sensor = preset("paper-16x1024").resize(8, 64)
     upsampler = models.Upsampler(models.create("bilinear"), sensor, sensor.resize(16, 64))
@@ -433,7 +456,7 @@ def test_threads_that_share_an_upsampler_get_their_own_frames(graphs):
     expected = [upsampler._answer(image) for image in images]
     with ThreadPoolExecutor(4) as threads:
         answers = list(threads.map(upsampler._replay, images))
-    assert all(map(torch.equal, answers, expected))
+    assert all(torch.equal(answer.ranges, exact.ranges) for answer, exact in zip(answers, expected, strict=True))
     assert (len(graphs.graphs), graphs.replays) == (1, 11)
 
 
