@@ -7,7 +7,7 @@ from kernels.gather_blend import gather_blend
 from kernels.neighbour_attention import neighbour_attention
 from kernels.neighbour_attention.decoder import DecoderWeights, fused_decode, fused_decode_serves
 from kernels.neighbour_attention.table import Projected, project_pixels
-from kernels.plane_prior import plane_prior
+from kernels.planes import interpolate_planes
 from kernels.rays.mesh import Hits, Mesh
 from kernels.surfaces import surface_hypotheses, surface_likelihood, surface_median
 
@@ -22,8 +22,8 @@ __all__ = [
     "fused_decode_serves",
     "gather_blend",
     "gather_neighbours",
+    "interpolate_planes",
     "neighbour_attention",
-    "plane_prior",
     "project_pixels",
     "surface_hypotheses",
     "surface_likelihood",

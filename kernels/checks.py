@@ -22,7 +22,6 @@ __all__ = [
     "PARTED",
     "PRIORS",
     "RANGE_FLOOR",
-    "SHARPEST",
     "TOLERANCE",
     "WIDEST_GAP",
     "broadcast_batch",
@@ -41,10 +40,8 @@ PRIORS = ("none", "bilinear", "perspective")
 # Metres. The perspective prior divides by range, and no LiDAR measures below this.
 RANGE_FLOOR = 0.1
 # Two inverse ranges that differ by more than this share of the smaller one belong to different surfaces. Of 0.015,
-# 0.03, 0.05 and 0.1, this gave `plane_prior` the highest IoU at 128x2048 on scans held out of the training towns.
+# 0.03, 0.05 and 0.1, this gave `planes` the highest IoU at 128x2048 on scans held out of the training towns.
 PARTED = 0.03
-# From this sharpness on, a step jumps from 0 to 1 without values between.
-SHARPEST = 1e3
 
 # The constants down to `TOLERANCE` are those of `kernels.surfaces`. A neighbour has 9 hypotheses: its surface is
 # continued along its column with the outer pixel, with the inner one or not at all, and along its row likewise.

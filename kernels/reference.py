@@ -18,7 +18,6 @@ from kernels.checks import (
     LEAST_SCALE,
     PARTED,
     RANGE_FLOOR,
-    SHARPEST,
     TOLERANCE,
     WIDEST_GAP,
 )
@@ -31,9 +30,9 @@ __all__ = [
     "fused_decode",
     "gather_blend",
     "gather_neighbours",
+    "interpolate_planes",
     "neighbour_attention",
     "neighbours",
-    "plane_prior",
     "surface_hypotheses",
     "surface_likelihood",
     "surface_median",
@@ -139,16 +138,8 @@ def neighbour_attention(
     return tokens + F.linear(attended.transpose(2, 3).reshape(tokens.shape), weight, bias)
 
 
-def plane_prior(
-    image: torch.Tensor, queries: torch.Tensor, wrap: bool, sharpness: float, area_floor: float
-) -> torch.Tensor:
-    """`kernels.plane_prior` on image (B, H, W) and queries (B, Q, 2)."""
-
-    def step(x: torch.Tensor) -> torch.Tensor:
-        if sharpness >= SHARPEST:
-            return (x >= 0.5).to(x.dtype).where(~x.isnan(), x)
-        return 1 / (1 + ((1 - x) / x) ** sharpness)
-
+def interpolate_planes(image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+    """`kernels.interpolate_planes` on image (B, H, W) and queries (B, Q, 2)."""
     height = image.shape[1]
     rows, columns, _ = neighbours(queries, height, image.shape[2], wrap)
     inverse = 1 / image.clamp(min=RANGE_FLOOR)
@@ -164,16 +155,11 @@ def plane_prior(
     at_u, at_v = u - v - up, u + down - v
     expected = torch.where((at_u > 0) & (at_v < 0), torch.maximum(first, second), u + (v - u) * f)
     parted = (torch.stack((at_u, at_v, u - v)).abs() > PARTED * torch.minimum(u, v)).all(0) & (at_u * at_v > 0)
-    low, high, s = torch.minimum(u, v), torch.maximum(u, v), step(f)
-    expected = torch.where(parted, first.clamp(low, high) * (1 - s) + second.clamp(low, high) * s, expected)
-    expected = expected.clamp(low, high)
-    share = torch.where(u == v, f, (expected - u) / (v - u))
-    (left, right) = expected.split(1, -1)
+    expected = torch.where(parted, torch.where(f < 0.5, first, second), expected)
+    left, right = expected.clamp(torch.minimum(u, v), torch.maximum(u, v)).split(1, -1)
     apart = (left - right).abs() > PARTED * torch.minimum(left, right)
-    g = torch.where(apart, step(g), g)
-    across = torch.cat((1 - g, g), -1)
-    areas = torch.cat(((1 - share) * across, share * across), -1)
-    return (areas.clamp(min=area_floor) * torch.cat((u, v), -1)).log()
+    g = torch.where(apart, (g + 0.5).floor(), g)
+    return (1 / (left + (right - left) * g)).squeeze(-1)
 
 
 def fused_decode(

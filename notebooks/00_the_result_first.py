@@ -71,20 +71,21 @@ print("measured:", tuple(sparse.ranges.shape), " wanted:", tuple(truth.ranges.sh
 # ## 2. Two lines
 #
 # For every measured ray 16 are wanted, and hardly any of those was measured itself. The obvious method, `bilinear`,
-# interpolates between the four measured pixels around each wanted ray. The network `iln-prior` is that of the paper
-# behind this course, *Implicit LiDAR Network* (Kwon, Sung, Yoon, ICRA 2022), with additions of our own that notebooks
-# 05 and 08 explain.
+# interpolates between the four measured pixels around each wanted ray. The network `iln-surfaces` is our successor to
+# that of the paper behind this course, *Implicit LiDAR Network* (Kwon, Sung, Yoon, ICRA 2022). The paper's network
+# weighs the ranges of the four pixels. Ours continues the surface that each of them lies on, and weighs where these are
+# met.
 #
 # **Predict:** what will the obvious method do to the outline of a car?
 
 # %%
-model = models.load("iln-prior").to(device)
+model = models.load("iln-surfaces").to(device)
 network = model.upsample(sparse, truth.sensor)
 
 bilinear = models.load("bilinear").to(device).upsample(sparse, truth.sensor)
 
 # %% tags=["goal"]
-scans = {"measured, 16 beams": sparse, "bilinear": bilinear, "network (iln-prior)": network, "truth, 128 beams": truth}
+scans = {"measured, 16 beams": sparse, "bilinear": bilinear, "iln-surfaces": network, "truth, 128 beams": truth}
 figure, axes = plt.subplots(4, 1, figsize=(10, 6.4), sharex=True, layout="constrained")
 for axis, (title, scan) in zip(axes, scans.items(), strict=True):
     image = scan.ranges.cpu()
@@ -164,22 +165,22 @@ show_scene(plotter)
 
 # %%
 found = {}
-for name in ("bilinear", "iln-prior"):
+for name in ("bilinear", "iln-surfaces"):
     judge = metrics.ScanMetrics().to(device)
     judge.update(models.load(name).to(device).ranges(sparse, truth.sensor), truth)
     found[name] = {key: value.item() for key, value in judge.compute().items()}
     mae, iou, floating = (found[name][key] for key in ("mae", "iou", "floating"))
-    print(f"{name:>9}: MAE {mae:.2f} m, IoU {iou:.3f}, floating {floating:.1%}")
+    print(f"{name:>12}: MAE {mae:.2f} m, IoU {iou:.3f}, floating {floating:.1%}")
 
 # The next cell relies on these.
-assert found["iln-prior"]["mae"] < found["bilinear"]["mae"]
-assert found["iln-prior"]["iou"] > 1.1 * found["bilinear"]["iou"]
-assert found["iln-prior"]["floating"] < 0.6 * found["bilinear"]["floating"]
+assert found["iln-surfaces"]["mae"] < found["bilinear"]["mae"]
+assert found["iln-surfaces"]["iou"] > 1.1 * found["bilinear"]["iou"]
+assert found["iln-surfaces"]["floating"] < 0.6 * found["bilinear"]["floating"]
 
 # %% [markdown]
-# The network wins in all three. And yet, like bilinear interpolation, it only *blends* the four measured neighbours: it
-# never leaves their span, though it can still put a point between two of them. What it learned is **how much to trust
-# each of them.** That is the idea of the paper: a network that predicts *weights*, where others predict *values*.
+# The network wins in all three. And yet, like bilinear interpolation, it only uses the four measured neighbours and the
+# pixels beside them: no range is made up. What it learned is **how much to trust each of them.** That is the idea of
+# the paper: a network that predicts *weights*, where others predict *values*.
 #
 # ### Exercise 1 · A size of your own
 #

@@ -440,35 +440,31 @@ _ = interact(draw_walk, number=(0, len(edges) - 1, 1))
 #
 # Scores can be added to something that is already right. `gather_blend` adds a prior $p$ to them:
 # $w = \operatorname{softmax}(s + p)$. If the last layer of $h$ starts at zero, the untrained network **is** the formula
-# behind the prior, and training only has to learn where to deviate from it. That is `iln-prior`, ours.
+# behind the prior, and training only has to learn where to deviate from it.
 #
 # **Predict:** it starts as the perspective blend of notebook 03, which is right on planes. Will 120 steps of training
 # raise its MAE, its IoU, both?
 
 # %%
 torch.manual_seed(0)
-perspective = models.create("iln-prior", snap=0.0, blocks=4).to(device)
+perspective = models.create("iln", prior="perspective", blocks=4).to(device)
 with torch.no_grad():
     off = (perspective(image, queries) - models.create("bilinear-inverse")(image, queries)).abs().mean()
 print(f"untrained, and bilinear over inverse range: {1000 * off:.1f} mm apart in the mean")
 assert off < 1e-2
 
 curve = train(perspective, STEPS)
-perspective.snap = 0.02
-perspective.eval()  # it snaps in inference only
-snapped = judge(perspective)
-for name, point in (("untrained", curve[0]), ("trained", curve[STEPS]), ("trained, snapped", snapped)):
-    print(f"iln-prior, {name:>16}: MAE {point['mae']:.2f} m, IoU {point['iou']:.3f}")
+for name, point in (("untrained", curve[0]), ("trained", curve[STEPS])):
+    print(f"iln with a prior, {name:>9}: MAE {point['mae']:.2f} m, IoU {point['iou']:.3f}")
 assert curve[0]["iou"] > last["weights (ILN)"] or not FAST
 assert curve[STEPS]["mae"] < curve[0]["mae"]
-assert snapped["iou"] > curve[STEPS]["iou"]
 
 # %% [markdown]
 # It starts where ILN would be after a long training. Then the MAE falls, and so does the IoU: L1 in metres is won at
-# edges, where errors are large, and pays for it with centimetres on planes, which is what 10 cm cubes count. So
-# `iln-prior` does one more thing when it answers: where it is within 2 % of what planes through the pixels around would
-# say, it says what they say (`snap=0.02`). **The network says which surface, the planes say where on it.** Notebook 08
-# looks at what each of the two gives.
+# edges, where errors are large, and pays for it with centimetres on planes, which is what 10 cm cubes count. Our own
+# network, `iln-surfaces`, need not pay: it weighs where the *surfaces* of the neighbours, continued, are met along the
+# query (`kernels.surfaces`). On planes all of them say the same. **The surfaces say where, the network says which.** It
+# stands beside the others in notebook 08.
 
 # %% [markdown]
 # ### Exercise 3 · A prior as scores

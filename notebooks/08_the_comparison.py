@@ -284,7 +284,7 @@ loaded = {name: models.load(name).to(device) for name in RULES + NETWORKS}
 # We take one scan and three answers that are wrong in different ways:
 #
 # - `planes`: a rule that lays planes through the pixels around a query and answers with the one that the query lies on;
-#   at a jump it takes one side instead of a mixture (`kernels.plane_prior`). Nothing in it is learned;
+#   at a jump it takes one side instead of a mixture (`kernels.interpolate_planes`). Nothing in it is learned;
 # - *noisy truth*: the truth with an error of 5 cm (standard deviation) in every pixel;
 # - *mended planes*: the truth, except for the worst 5 % of the pixels of `planes`, which stay as bad as they are.
 #

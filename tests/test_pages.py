@@ -53,7 +53,7 @@ def test_the_figures_are_those_that_were_measured(page, sizes):
         measured = {(row["model"], row["size"]): row for row in csv.DictReader(file)}
     rows = re.findall(r"^\| `([\w-]+)`[^|]*\|(.*)\|$", (ROOT / page).read_text(), re.MULTILINE)
     rows = {name: cells.split("|") for name, cells in rows if cells.count("|") == 5 * len(sizes) - 1}
-    assert rows.keys() >= {"bilinear", "planes", "liif", "iln", "iln-prior"}
+    assert rows.keys() >= {"bilinear", "planes", "liif", "iln", "iln-surfaces"}
     for name, cells in rows.items():
         for number, size in enumerate(sizes):
             ours, paper = cells[5 * number : 5 * number + 3], cells[5 * number + 3 : 5 * number + 5]

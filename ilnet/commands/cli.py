@@ -274,7 +274,7 @@ def _json(value: Any) -> str:
 @click.argument("out", metavar="OUT", type=Path)
 @click.option("--size", type=_Size(), help="Rays to predict, over the same field of view.")
 @click.option("--sensor", metavar="NAME", help="Preset to predict, instead of --size.")
-@click.option("--model", "name", default="iln-prior", show_default=True, metavar="NAME|FILE")
+@click.option("--model", "name", default="iln-surfaces", show_default=True, metavar="NAME|FILE")
 @click.option("--from", "origin", metavar="NAME", help="Preset with the angles of IN, if its files do not hold them.")
 @click.option(
     "--format",
@@ -453,9 +453,7 @@ def towns(names: tuple[str, ...], out: Path) -> None:
 
 
 @cli.command()
-@click.argument(
-    "names", nargs=-1, type=click.Choice(["table", "convergence", "attention", "prior", "rays", "real", "all"])
-)
+@click.argument("names", nargs=-1, type=click.Choice(["table", "convergence", "attention", "rays", "real", "all"]))
 @click.option(
     "--preset", help="Preset of each training. By default small, and table and real use the networks that ship."
 )

@@ -12,7 +12,7 @@ from ilnet.world import places, simulate
 
 __all__ = ["METHODS", "TOWN", "from_town", "run"]
 
-METHODS = ("nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-prior")
+METHODS = ("nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-surfaces")
 # A test town: no network was trained and nothing was chosen in it.
 TOWN = "town10"
 _WAYPOINT = 1400
@@ -48,5 +48,5 @@ def run(scan: Scan, truth: Scan, out: Path, source: str) -> dict[str, Any]:
     plot.range_images(pictures, out / "range_images.png", f"{source}: range images")
     plot.range_images(pictures, out / "range_images_sector.png", f"{source}: 90° of them", sector=90)
     plot.point_clouds({n: s for n, s in pictures.items() if n != "nearest"}, out / "points.png")
-    scan_files.write(out / "iln-prior.ply", upsampled["iln-prior"])
+    scan_files.write(out / "iln-surfaces.ply", upsampled["iln-surfaces"])
     return {"methods": figures, "input": scan.sensor.size, "output": truth.sensor.size}

@@ -52,7 +52,13 @@ PAPER = {
 
 # Distinguishable for the colour-blind, and in print.
 _SERIES = "#0072b2", "#e69f00", "#009e73", "#cc79a7"
-_COLOURS = {"liif": "#d55e00", "iln": "#0072b2", "iln-prior": "#009e73", "lidar-sr": "#cc79a7", "bilinear": "#999999"}
+_COLOURS = {
+    "liif": "#d55e00",
+    "iln": "#0072b2",
+    "iln-surfaces": "#009e73",
+    "lidar-sr": "#cc79a7",
+    "bilinear": "#999999",
+}
 
 
 @dataclass(frozen=True)
@@ -106,7 +112,7 @@ class Study:
 
     def networks(self) -> dict[str, str | Path]:
         """Returns the networks that are compared with other methods."""
-        return {name: self.trained(name, name) if self.preset else name for name in ("liif", "iln", "iln-prior")}
+        return {name: self.trained(name, name) if self.preset else name for name in ("liif", "iln", "iln-surfaces")}
 
     def compare(
         self, files: Mapping[str, str | Path | models.Model], sizes: Sequence[tuple[int, int]] = ()
@@ -308,10 +314,10 @@ def _bars(study: Study, name: str, rows: Sequence[dict[str, Any]], by: str, titl
     figure = Figure(figsize=(9, 3), layout="constrained")
     for axis, (key, words) in zip(figure.subplots(1, 2), (("iou", "IoU"), ("mae", "MAE [m]")), strict=True):
         kinds = list(dict.fromkeys(str(row[by]) for row in rows))
-        for number, (kind, colour) in enumerate(zip(kinds, _SERIES, strict=False)):
+        for number, kind in enumerate(kinds):
             chosen = [row for row in rows if str(row[by]) == kind]
             at = np.arange(len(chosen)) + (number - (len(kinds) - 1) / 2) * 0.8 / len(kinds)
-            axis.bar(at, [row[key] for row in chosen], 0.8 / len(kinds), label=kind, color=colour)
+            axis.bar(at, [row[key] for row in chosen], 0.8 / len(kinds), label=kind, color=_SERIES[number])
         axis.set_xticks(range(len(chosen)), [row["size"] for row in chosen])
         axis.set_ylabel(words)
     axis.legend(title=title, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
@@ -387,7 +393,7 @@ def ratios(done: Mapping[str, Sequence[dict[str, Any]]]) -> list[dict[str, str]]
     table = {(row["model"], row["size"]): row for row in done.get("table", ())}
     for key, words in (("iou", "IoU"), ("mae", "MAE")):
         column = {"mae": 0, "iou": 1}[key]
-        for one, other in (("iln", "liif"), ("iln", "bilinear"), ("iln-prior", "bilinear"), ("iln-prior", "iln")):
+        for one, other in (("iln", "liif"), ("iln", "bilinear"), ("iln-surfaces", "iln"), ("iln-surfaces", "planes")):
             for size, paper in PAPER.items():
                 if {(one, size), (other, size)} <= table.keys():
                     theirs = paper[one][column] / paper[other][column] if {one, other} <= paper.keys() else None
@@ -399,9 +405,9 @@ def ratios(done: Mapping[str, Sequence[dict[str, Any]]]) -> list[dict[str, str]]
         found.append({"figure": figure, "the paper": "much more", "ours": ours})
     real = {(row["model"], row["scan"], row["beams"], row["size"]): row for row in done.get("real", ())}
     for model, *case in real:
-        if model == "iln-prior":
-            figure = f"IoU of iln-prior over bilinear, {case[0]}, {case[1]} beams -> {case[2]}"
-            add(figure, real[model, *case], real["bilinear", *case], "iou")
+        if model == "iln-surfaces":
+            figure = f"IoU of iln-surfaces over planes, {case[0]}, {case[1]} beams -> {case[2]}"
+            add(figure, real[model, *case], real["planes", *case], "iou")
     return found
 
 

@@ -36,7 +36,6 @@ __all__ = [
     "save",
 ]
 
-# The prior and the snap of `iln-prior` were chosen on held-out scans of the training towns.
 _MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
     "nearest": (Nearest, {}),
     "bilinear": (Bilinear, {}),
@@ -45,7 +44,6 @@ _MODELS: dict[str, tuple[type[Model], dict[str, Any]]] = {
     "liif": (LIIF, {}),
     "lidar-sr": (LiDARSR, {}),
     "iln": (ILN, {}),
-    "iln-prior": (ILN, {"prior": "perspective", "snap": 0.02}),
     "iln-surfaces": (Surfaces, {}),
 }
 NAMES = tuple(_MODELS)

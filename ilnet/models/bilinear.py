@@ -3,9 +3,9 @@
 import torch
 
 from ilnet.models.base import Model
-from kernels import gather_blend, plane_prior
+from kernels import gather_blend, interpolate_planes
 
-__all__ = ["Bilinear", "Nearest", "Planes", "interpolate_planes"]
+__all__ = ["Bilinear", "Nearest", "Planes"]
 
 
 class Nearest(Model):
@@ -35,16 +35,9 @@ class Bilinear(Model):
         return gather_blend(image, queries, scores, self.prior, wrap, backend=self.backend)
 
 
-def interpolate_planes(image: torch.Tensor, queries: torch.Tensor, wrap: bool, backend: str) -> torch.Tensor:
-    """Returns ranges (B, Q) [m] of queries (B, Q, 2) in images (B, H, W) [m] by planes; see `kernels.plane_prior`."""
-    return gather_blend(
-        image, queries, plane_prior(image, queries, wrap, backend=backend), "none", wrap, backend=backend
-    )
-
-
 class Planes(Model):
-    """The planes around a query, continued to their crease or edge; see `kernels.plane_prior`."""
+    """The planes around a query, continued to their crease or edge; see `kernels.planes`."""
 
     def decode(self, encoded: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Returns the ranges (B, Q) [m] of queries (B, Q, 2)."""
-        return interpolate_planes(image, queries, wrap, self.backend)
+        return interpolate_planes(image, queries, wrap, backend=self.backend)

@@ -6,7 +6,6 @@ import torch
 from torch import nn
 
 from ilnet.models.base import OFFSET_SCALE, Model, normalised
-from ilnet.models.bilinear import interpolate_planes
 from ilnet.models.encoder import Encoder
 from ilnet.sensor import Sensor
 from kernels import (
@@ -87,13 +86,11 @@ class ILN(Model):
         blocks: Residual blocks of the encoder.
         heads: Attention heads; they divide `features`.
         dropout: Dropout rate in the attention blocks during training; the authors use 0.1.
-        snap: Share of the range. In inference, a prediction that differs from that of `kernels.plane_prior` by less is
-            replaced by it: the network decides which surface is seen, the planes decide where on it.
         area_floor: Least bilinear area in the prior; above 0, so that the network can overrule a measured pixel.
         norm_range: The range [m] that the encoder sees as +1; no return is filled with it.
 
     Raises:
-        ValueError: If the prior is unknown, the heads do not divide the features, or `snap` is not a share.
+        ValueError: If the prior is unknown, or the heads do not divide the features.
 
     Source: paper Sec. II-B, Figs. 2 and 3; sizes as in the authors' code. 1,244,673 parameters at D = 1.
     """
@@ -106,18 +103,14 @@ class ILN(Model):
         blocks: int = 16,
         heads: int = 8,
         dropout: float = 0.0,
-        snap: float = 0.0,
         area_floor: float = 1e-4,
         norm_range: float = 100.0,
     ):
         check_prior(prior)
         if heads < 1 or features % heads:
             raise ValueError(f"heads is {heads}; it should divide the {features} features")
-        if not 0 <= snap < 1:
-            raise ValueError(f"snap is {snap}; it should be at least 0 and below 1, a share of the range")
         super().__init__()
-        self.prior, self.snap, self.area_floor = prior, snap, area_floor
-        self.norm_range, self.dropout = norm_range, dropout
+        self.prior, self.area_floor, self.norm_range, self.dropout = prior, area_floor, norm_range, dropout
         self.encoder = Encoder(features, blocks)
         self.position = nn.Linear(2, features)
         self.blocks = nn.ModuleList(Block(features, heads, dropout) for _ in range(depth))
@@ -139,13 +132,6 @@ class ILN(Model):
 
     def decode(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Blends the ranges of the 4 neighbours of each query, with predicted weights."""
-        ranges = self._blend(encoded, image, queries, wrap)
-        if self.training or self.snap == 0:
-            return ranges
-        planes = interpolate_planes(image, queries, wrap, self.backend)
-        return planes.where((ranges - planes).abs() < self.snap * planes, ranges)
-
-    def _blend(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         features, projected = encoded
         blocks, prior, floor = self.blocks, self.prior, self.area_floor
         if projected is not None and self.is_fused(encoded):  # all that follows as one kernel

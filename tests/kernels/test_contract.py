@@ -20,8 +20,8 @@ from kernels import (
     fused_decode,
     gather_blend,
     gather_neighbours,
+    interpolate_planes,
     neighbour_attention,
-    plane_prior,
     project_pixels,
     surface_hypotheses,
     surface_likelihood,
@@ -137,7 +137,7 @@ CASES = {
 }
 
 OTHERS = {
-    "plane_prior": Case(plane_prior, ("image", "queries")),
+    "interpolate_planes": Case(interpolate_planes, ("image", "queries")),
     "fused_decode": Case(whole_decoder, ("features", "queries", "qkv_weight", "image")),
     "surface_hypotheses": Case(surface_hypotheses, RAYS),
     "surface_median": Case(lambda *tensors: surface_median(*tensors)[0], (*RAYS, "hypothesis_scores", "scores")),

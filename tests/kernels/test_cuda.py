@@ -16,7 +16,7 @@ MODULES = [
     "neighbour_attention.decoder",
     "neighbour_attention.heads",
     "neighbour_attention.vectors",
-    "plane_prior",
+    "planes",
     "rays.mesh",
     "rays.projection",
     "scatter",

@@ -12,9 +12,9 @@ import torch
 import warp as wp
 from torch.utils.data import DataLoader, Dataset
 
-from kernels import Mesh, gather_blend, plane_prior
+from kernels import Mesh, gather_blend, interpolate_planes
 from kernels.launch import concrete, launch
-from kernels.plane_prior import _kernels as _plane_prior
+from kernels.planes import _kernels as _planes
 from kernels.stencil import grid_of
 
 QUERIES = 20_000  # enough to be split over cores
@@ -78,7 +78,7 @@ def kernel_folders(cache):
 
 @pytest.mark.parametrize("cores", [1, 2])
 def test_threads_that_launch_first_load_a_module_one_after_the_other(cores, monkeypatch, one_thread):
-    module = _plane_prior[torch.float32].module
+    module = _planes[torch.float32].module
     load, asked, first_may_go = module.load, [], threading.Event()
 
     def slow(device, block_dim=None):
@@ -92,7 +92,7 @@ def test_threads_that_launch_first_load_a_module_one_after_the_other(cores, monk
     results = []
 
     def use():
-        results.append(plane_prior(torch.ones(1, 4, 5), torch.ones(1, QUERIES, 2)))
+        results.append(interpolate_planes(torch.ones(1, 4, 5), torch.ones(1, QUERIES, 2)))
 
     threads = [threading.Thread(target=use) for _ in range(4)]
     for thread in threads:
@@ -108,13 +108,13 @@ def test_threads_that_launch_first_load_a_module_one_after_the_other(cores, monk
     assert set(asked) == {1}  # never another block size
 
 
-@pytest.mark.parametrize("moved", ["image", "queries", "prior_out"])
+@pytest.mark.parametrize("moved", ["image", "queries", "ranges_out"])
 def test_tensors_on_two_devices_are_named_before_a_kernel_sees_them(moved):
-    tensors = {"image": torch.ones(1, 4, 5), "queries": torch.ones(1, 7, 2), "prior_out": torch.empty(1, 7, 4)}
+    tensors = {"image": torch.ones(1, 4, 5), "queries": torch.ones(1, 7, 2), "ranges_out": torch.empty(1, 7)}
     tensors[moved] = tensors[moved].to("meta")
-    image, queries, prior = tensors.values()
+    image, queries, ranges = tensors.values()
     with pytest.raises(ValueError, match=rf"(?=.*{moved})(?=.* is on meta|.*be on meta)"):
-        launch(_plane_prior[torch.float32], 7, [image, queries, 4.0, 0.0, grid_of(4, 5, True)], [prior])
+        launch(_planes[torch.float32], 7, [image, queries, grid_of(4, 5, True)], [ranges])
 
 
 def test_any_number_of_cores_gives_the_same(one_thread):

@@ -10,7 +10,7 @@ import pytest
 from ilnet import models, scan_files
 from ilnet.learning import metrics
 
-METHODS = {"nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-prior"}
+METHODS = {"nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-surfaces"}
 
 
 def ilnet(*arguments, cwd):
@@ -58,12 +58,12 @@ def test_demo_of_the_town_prints_a_table_and_draws(tmp_path):
     assert set(table) >= METHODS
     mae, iou = ({name: float(table[name][column]) for name in METHODS} for column in (0, 1))
     assert mae["iln"] < mae["bilinear"]
-    assert mae["iln-prior"] < mae["bilinear"]
-    assert iou["iln-prior"] > iou["bilinear"]
+    assert mae["iln-surfaces"] < mae["bilinear"]
+    assert iou["iln-surfaces"] > iou["bilinear"]
     pictures = tmp_path / "demo_output"
     for name in ("range_images.png", "range_images_sector.png", "points.png"):
         assert (pictures / name).read_bytes()[:4] == b"\x89PNG"
-    assert (pictures / "iln-prior.ply").read_bytes()[:3] == b"ply"
+    assert (pictures / "iln-surfaces.ply").read_bytes()[:3] == b"ply"
 
 
 def test_demo_of_a_mesh_prints_one_json_object(tmp_path, mesh_file):
@@ -123,11 +123,11 @@ def test_evaluate_of_a_scan_judges_at_its_own_size(command, scan_file):
 
 
 def test_evaluate_in_a_town_prints_a_table(command):
-    methods = ("--model", "iln-prior", "--model", "nearest")
+    methods = ("--model", "iln-surfaces", "--model", "nearest")
     code, out, _ = command("evaluate", *methods, "--scene", "town01", "--size", "32x512", "--scans", 2)
     assert code == 0
     rows = {line.split()[0]: [float(word) for word in line.split()[1:]] for line in out.splitlines()[-2:]}
-    assert rows["iln-prior"][0] < rows["nearest"][0]
+    assert rows["iln-surfaces"][0] < rows["nearest"][0]
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".stl", ".vtp"])

@@ -50,7 +50,7 @@ def test_the_table_has_every_method_at_every_size_beside_the_paper(study):
     assert [(row["size"], row["model"]) for row in found] == [
         (size, name)
         for size in ("16x256", "32x512")
-        for name in ("nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-prior")
+        for name in ("nearest", "bilinear", "bilinear-inverse", "planes", "liif", "iln", "iln-surfaces")
     ]
     assert all(0 < float(row["iou"]) <= 1 for row in found if row["model"] != "liif")
     assert {path.name for path in study.out.glob("*.png")} == {"table.png", "points-town07.png", "points-town10.png"}
@@ -120,7 +120,7 @@ def test_ablations_and_measured_scans(study, tmp_path, yard):
 
 def test_without_a_preset_the_networks_that_ship_are_compared(study, monkeypatch):
     study = experiment.Study(None, study.out)
-    assert study.networks() == {name: name for name in ("liif", "iln", "iln-prior")}
+    assert study.networks() == {name: name for name in ("liif", "iln", "iln-surfaces")}
     trained = []
     monkeypatch.setattr(train, "train", lambda name, preset_name, *args, **kwargs: trained.append((name, preset_name)))
     study.trained("iln-0", "iln")
@@ -152,8 +152,8 @@ def test_ratios_by_hand():
     def row(model, iou, mae, **more):
         return {"model": model, "size": "128x2048", "iou": str(iou), "mae": str(mae), **more}
 
-    table = [row("liif", 0.2, 2.0), row("bilinear", 0.1, 4.0), row("iln", 0.3, 1.0), row("iln-prior", 0.36, 1.0)]
-    real = [row(name, iou, 1.0, scan="street", beams="32") for name, iou in (("bilinear", 0.2), ("iln-prior", 0.25))]
+    table = [row("liif", 0.2, 2.0), row("bilinear", 0.1, 4.0), row("iln", 0.3, 1.0), row("iln-surfaces", 0.36, 1.0)]
+    real = [row(name, iou, 1.0, scan="street", beams="32") for name, iou in (("planes", 0.2), ("iln-surfaces", 0.25))]
     curves = [{"model": name, "step": "10", "iou": str(iou)} for name, iou in (("iln", 0.3), ("liif", 0.2))]
     found = {row["figure"]: row for row in experiment.ratios({"table": table, "real": real, "convergence": curves})}
     assert found["IoU of iln over liif, 128x2048"] == {
@@ -162,12 +162,12 @@ def test_ratios_by_hand():
         "ours": "1.50",
     }
     assert found["MAE of iln over liif, 128x2048"]["ours"] == "0.50"
-    assert found["IoU of iln-prior over iln, 128x2048"] == {
-        "figure": "IoU of iln-prior over iln, 128x2048",
+    assert found["IoU of iln-surfaces over iln, 128x2048"] == {
+        "figure": "IoU of iln-surfaces over iln, 128x2048",
         "the paper": "",
         "ours": "1.20",
     }
-    assert found["IoU of iln-prior over bilinear, street, 32 beams -> 128x2048"]["ours"] == "1.25"
+    assert found["IoU of iln-surfaces over planes, street, 32 beams -> 128x2048"]["ours"] == "1.25"
     [steps] = [row["ours"] for figure, row in found.items() if figure.startswith("steps of liif")]
     assert steps == "never in its budget"
     assert experiment.ratios({}) == []

@@ -32,7 +32,7 @@ def seen(tmp_path, yard):
 def test_one_file_by_size(run, seen, tmp_path):
     assert run("in.npz", "out/dense.npz", "--size", "20x300") == (0, "1 scan(s) written to out/dense.npz\n", [])
     dense = scan_files.read(tmp_path / "out" / "dense.npz")
-    expected = models.load("iln-prior").upsample(seen, SENSOR.resize(20, 300))
+    expected = models.load("iln-surfaces").upsample(seen, SENSOR.resize(20, 300))
     assert dense.sensor == expected.sensor
     assert torch.allclose(dense.ranges, expected.ranges.cpu(), atol=1e-3)
 

@@ -31,7 +31,7 @@ def quick(monkeypatch, quiet_place):
     monkeypatch.setitem(train.PRESETS, "tiny", size)
     monkeypatch.setattr(train, "HELD_OUT_SENSORS", ("os1-32",))
 
-    def run(out, name="iln-prior", **options):
+    def run(out, name="iln", **options):
         return train.train(name, "tiny", out, **{"features": 16, "heads": 4, **options})
 
     return run
@@ -40,9 +40,9 @@ def quick(monkeypatch, quiet_place):
 def test_writes_weights_that_load_and_figures(tmp_path, quick):
     figures = quick(tmp_path)
     assert set(figures) == {f"val/{name}" for name in metrics.FIGURES}
-    model = models.load(tmp_path / "iln-prior.safetensors")
-    assert model.prior == models.create("iln-prior").prior
-    with open(tmp_path / "iln-prior" / "from-step-0" / "metrics.csv") as log:
+    model = models.load(tmp_path / "iln.safetensors")
+    assert isinstance(model, models.ILN)
+    with open(tmp_path / "iln" / "from-step-0" / "metrics.csv") as log:
         assert any(row["val/iou"] for row in csv.DictReader(log))
 
 
@@ -50,7 +50,7 @@ def test_the_same_seed_gives_the_same_weights(tmp_path, quick):
     weights = []
     for number, seed in enumerate((0, 0, 1)):
         quick(tmp_path / str(number), seed=seed)
-        weights.append(models.load(tmp_path / str(number) / "iln-prior.safetensors").state_dict())
+        weights.append(models.load(tmp_path / str(number) / "iln.safetensors").state_dict())
     assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
     assert not torch.equal(weights[0]["position.weight"], weights[2]["position.weight"])
 
@@ -149,14 +149,14 @@ def test_an_interrupted_run_goes_on_to_the_same_weights(tmp_path, quick, monkeyp
         cut.setattr(train.Training, "training_step", step_or_die)
         with pytest.raises(SystemError):
             quick(tmp_path / "cut", steps=6)
-    assert (tmp_path / "cut" / "iln-prior" / "last.ckpt").exists()
+    assert (tmp_path / "cut" / "iln" / "last.ckpt").exists()
     with pytest.raises(ValueError, match=r"is an interrupted run of .*'steps': 6"):
         quick(tmp_path / "cut", steps=8)
     quick(tmp_path / "cut", steps=6)
-    whole, cut = (models.load(tmp_path / run / "iln-prior.safetensors").state_dict() for run in ("whole", "cut"))
+    whole, cut = (models.load(tmp_path / run / "iln.safetensors").state_dict() for run in ("whole", "cut"))
     assert all(torch.equal(whole[key], cut[key]) for key in whole)
     # Both starts left their figures, and a finished run leaves no checkpoint to stumble over.
-    assert {p.name for p in (tmp_path / "cut" / "iln-prior").iterdir()} == {"from-step-0", "from-step-4"}
+    assert {p.name for p in (tmp_path / "cut" / "iln").iterdir()} == {"from-step-0", "from-step-4"}
 
 
 def test_a_run_cut_in_a_validation_makes_up_for_it(tmp_path, quick, monkeypatch):
@@ -174,13 +174,13 @@ def test_a_run_cut_in_a_validation_makes_up_for_it(tmp_path, quick, monkeypatch)
         cut.setattr(train.Training, "validation_step", validate_or_die)
         with pytest.raises(SystemError):
             quick(tmp_path / "cut", steps=6)
-    kept = torch.load(tmp_path / "cut" / "iln-prior" / "last.ckpt", weights_only=True)
+    kept = torch.load(tmp_path / "cut" / "iln" / "last.ckpt", weights_only=True)
     [best] = [state["best_model_score"] for key, state in kept["callbacks"].items() if "ModelCheckpoint" in key]
     quick(tmp_path / "cut", steps=6)
 
     def validated(run):
         found = []
-        for log in sorted((tmp_path / run / "iln-prior").glob("from-step-*/metrics.csv")):
+        for log in sorted((tmp_path / run / "iln").glob("from-step-*/metrics.csv")):
             with open(log, newline="") as file:
                 found += [(row["step"], row["val/iou"]) for row in csv.DictReader(file) if row["val/iou"]]
         return found
@@ -188,14 +188,14 @@ def test_a_run_cut_in_a_validation_makes_up_for_it(tmp_path, quick, monkeypatch)
     assert [step for step, _ in validated("whole")] == ["1", "3", "5"]
     assert validated("cut") == validated("whole")
     assert best == pytest.approx(float(validated("cut")[0][1]))  # the run that went on knew how good the best was
-    whole, cut = (models.load(tmp_path / run / "iln-prior.safetensors").state_dict() for run in ("whole", "cut"))
+    whole, cut = (models.load(tmp_path / run / "iln.safetensors").state_dict() for run in ("whole", "cut"))
     assert all(torch.equal(whole[key], cut[key]) for key in whole)
 
 
 def test_the_figures_are_those_of_the_final_weights(tmp_path, quick, monkeypatch):
     monkeypatch.setattr(train, "VALIDATE_EVERY", (3, 3))
     figures = quick(tmp_path, steps=5)
-    model = models.load(tmp_path / "iln-prior.safetensors")
+    model = models.load(tmp_path / "iln.safetensors")
     [[scan, truth]] = places.held_out_scans(train.places.town(), 1, [PAPER_INPUT, train.VALIDATION])
     mae = metrics.compare(model.ranges(scan, truth.sensor), truth)["mae"]
     assert mae == pytest.approx(figures["val/mae"], rel=0.05)  # float32 here, bfloat16 there
@@ -236,7 +236,7 @@ def test_unknown_names_are_refused(tmp_path):
 
 def test_the_head_of_a_network_with_a_prior_gets_a_gradient(yard):
     """Zero scores at the start must not be a dead end."""
-    model = models.create("iln-prior", features=16, blocks=1, heads=4)
+    model = models.create("iln", prior="perspective", features=16, blocks=1, heads=4)
     here = pose((0.0, 0.0, 1.8))
     image = simulate.scan(yard, preset("paper-16x1024"), here).filled().unsqueeze(0)
     queries = torch.rand(1, 500, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([15.0, 1024.0])
@@ -276,10 +276,10 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_batch(tmp_path, quick, mo
     monkeypatch.setattr(data.ContinuousRays, "_draw", spoilt(data.ContinuousRays._draw, 2))
     with pytest.raises(ValueError, match=r"the loss of step 2 is nan.*step-2.pt .*weights of step 0"):
         quick(tmp_path)
-    kept = torch.load(tmp_path / "iln-prior" / "step-2.pt")
+    kept = torch.load(tmp_path / "iln" / "step-2.pt")
     assert kept["batch"]["ranges"].isnan().any()
     assert Sensor(**kept["batch"]["sensor"]).shape == tuple(kept["batch"]["image"].shape[1:])
-    first = models.create("iln-prior", blocks=1, features=16, heads=4)
+    first = models.create("iln", blocks=1, features=16, heads=4)
     assert kept["model"].keys() == first.state_dict().keys()
     assert all(weight.isfinite().all() for weight in kept["model"].values())
 
@@ -292,7 +292,7 @@ def test_no_checkpoint_holds_weights_after_a_loss_that_is_not_finite(tmp_path, q
     monkeypatch.setattr(data.ContinuousRays, "_draw", spoilt(data.ContinuousRays._draw, 4))
     with pytest.raises(ValueError, match=r"the loss of step 4 is nan.*weights of step [34]"):
         quick(tmp_path, steps=9)
-    kept = torch.load(tmp_path / "iln-prior" / "last.ckpt", weights_only=True)
+    kept = torch.load(tmp_path / "iln" / "last.ckpt", weights_only=True)
     assert kept["global_step"] in (3, 4)
     assert all(weight.isfinite().all() for weight in kept["state_dict"].values())
 
@@ -312,7 +312,7 @@ def test_all_processes_stop_when_the_loss_of_one_is_not_finite(tmp_path):
     said = [(tmp_path / "two" / f"rank-{rank}.txt").read_text() for rank in (0, 1)]
     assert said[0] == "the loss of step 1 is not finite in another process"
     assert said[1].startswith("the loss of step 1 is nan; it should be finite: ")
-    [kept] = (tmp_path / "two" / "iln-prior").glob("step-*.pt")
+    [kept] = (tmp_path / "two" / "iln").glob("step-*.pt")
     assert kept.name == "step-1-process-1.pt"
     assert torch.load(kept)["batch"]["ranges"].isnan().all()
 
