@@ -55,9 +55,9 @@ OWN = None  # weights of your own, such as "runs/iln.safetensors", which `python
 
 pyvista.vtk_verbosity("off")
 device = "cuda" if torch.cuda.is_available() else "cpu"
-RULES, NETWORKS = ("nearest", "bilinear", "bilinear-inverse", "planes"), ("liif", "iln", "iln-prior")
+RULES, NETWORKS = ("nearest", "bilinear", "bilinear-inverse", "planes"), ("liif", "iln", "iln-surfaces")
 COLOURS = {"nearest": "#cc79a7", "bilinear": "#999999", "bilinear-inverse": "#e69f00", "planes": "#56b4e9"}
-COLOURS |= {"liif": "#d55e00", "iln": "#0072b2", "iln-prior": "#009e73", "own": "black"}
+COLOURS |= {"liif": "#d55e00", "iln": "#0072b2", "iln-surfaces": "#009e73", "own": "black"}
 MARKERS = dict(zip(COLOURS, "Pov^sDXp", strict=True))
 
 # %% [markdown]
@@ -432,8 +432,9 @@ mean = {size: {n: {k: v.mean() for k, v in f.items()} for n, f in found.items()}
 for found in mean.values():
     assert found["planes"]["iou"] > max(found[n]["iou"] for n in ("liif", "iln"))
     assert max(found[n]["mae"] for n in NETWORKS) < min(found[n]["mae"] for n in RULES)
-    assert found["iln-prior"]["iou"] > found["iln"]["iou"] > found["liif"]["iou"]
+    assert found["iln-surfaces"]["iou"] > found["iln"]["iou"] > found["liif"]["iou"]
     assert found["liif"]["iou"] < found["bilinear"]["iou"]
+assert mean["64x1024"]["iln-surfaces"]["iou"] > mean["64x1024"]["planes"]["iou"]
 for theirs in PAPER.values():
     assert theirs["iln"][1] > theirs["liif"][1]
 assert PAPER["64x1024"]["liif"][1] > PAPER["64x1024"]["bilinear"][1]
@@ -458,16 +459,16 @@ plt.show()
 
 # %% [markdown]
 # *In words: two scatter plots of MAE against IoU, one for each size. Filled markers: the networks liif, iln and
-# iln-prior lie to the left, at the smallest errors; liif the lowest of the three, with an IoU below 0.3. The rules lie
-# to the right. Planes, a triangle, is the highest of all, at 64x1024 level with iln-prior. Hollow markers are the
-# paper's bilinear, liif and iln: all lower, iln above liif as here, but liif above bilinear.*
+# iln-surfaces lie to the left, at the smallest errors; liif the lowest of the three, with an IoU below 0.3. The rules
+# lie to the right, planes, a triangle, far above the others. At 64x1024 iln-surfaces is the highest of all. Hollow
+# markers are the paper's bilinear, liif and iln: all lower, iln above liif as here, but liif above bilinear.*
 #
 # Three things to read from it:
 #
-# - **Networks win the MAE, a rule keeps up in IoU.** `planes`, without a single learned number, is level with
-#   `iln-prior` in IoU at 64x1024 and ahead of it at 128x2048: the towns are made of planes, and section 2 says what the
-#   IoU is made of. Close to best in both is `iln-prior`, which says what the planes say where it is near to them. And
-#   `iln`, after 6000 steps, is level with `bilinear-inverse`, a formula of notebook 03.
+# - **Networks win the MAE, a rule keeps up in IoU.** `planes`, without a single learned number, is ahead of `iln` in
+#   IoU: the towns are made of planes, and section 2 says what the IoU is made of. `iln`, after 6000 steps, is level with
+#   `bilinear-inverse`, a formula of notebook 03. `iln-surfaces`, our own, continues the surface of each neighbour as a
+#   plane and learns which of these surfaces to trust: at 64x1024 it is ahead of `planes` as well.
 # - **Weights are ahead of values.** In metres `iln` and `liif` are a few percent apart. In IoU the one that predicts
 #   values is below bilinear: it has to *produce* every range, and centimetres are hard to produce. Where neighbours
 #   agree, a blend of measured ranges is right whatever the weights.
@@ -478,8 +479,8 @@ plt.show()
 # %% [markdown]
 # ## 4. How far do you trust the order?
 #
-# The spread behind `±` is large: ±0.1 in IoU, while `iln` and `iln-prior` are 0.075 apart. With eight scans the
-# standard error of a mean is its spread over $\sqrt 8$. Is `iln-prior` better than `iln`, then?
+# The spread behind `±` is large: ±0.1 in IoU, about as much as `iln` and `iln-surfaces` are apart. With eight scans
+# the standard error of a mean is its spread over $\sqrt 8$. Is `iln-surfaces` better than `iln`, then?
 #
 # **Predict:** the next figure shows the same numbers twice. On the left each method's mean with its standard error.
 # Beside it the *differences to `iln` on the same scan*, mean and standard error of those. Which bars are shorter, and
@@ -506,33 +507,27 @@ for axes, key, unit in ((panels[1], "iou", ""), (panels[2], "mae", " [m]")):
     axes.set(title="differences to iln, paired", ylabel=f"{key.upper() if key == 'mae' else 'IoU'} minus iln's{unit}")
     axes.set_xticks(range(len(others)), others, rotation=60, fontsize=8)
 plt.show()
-iou_prior, iou_iln = (found[name]["iou"] for name in ("iln-prior", "iln"))
 for key in ("iou", "mae"):
-    average, standard_error = paired["iln-prior", key]
-    print(f"iln-prior minus iln, {key}: {average:+.4f} ± {standard_error:.4f}")
-snapping = models.load("iln").to(device)
-snapping.snap = models.create("iln-prior").snap
-d = judge(snapping, pairs["64x1024"])["iou"] - iou_iln
-print(f"iln that snaps to planes minus iln, iou: {d.mean():+.4f} ± {d.std(ddof=1) / math.sqrt(len(d)):.4f}")
-assert d.mean() > 0.5 * paired["iln-prior", "iou"][0]
-alone = math.hypot(*(v.std(ddof=1) / math.sqrt(len(v)) for v in (iou_prior, iou_iln)))
+    average, standard_error = paired["iln-surfaces", key]
+    print(f"iln-surfaces minus iln, {key}: {average:+.4f} ± {standard_error:.4f}")
+both = [found[name]["iou"] for name in ("iln-surfaces", "iln")]
+alone = math.hypot(*(v.std(ddof=1) / math.sqrt(len(v)) for v in both))
 print(f"standard error of the same IoU difference, had each method seen other scans: {alone:.4f}")
-assert paired["iln-prior", "iou"][0] > 3 * paired["iln-prior", "iou"][1]
-assert alone > 4 * paired["iln-prior", "iou"][1]
-assert abs(paired["iln-prior", "mae"][0]) < 0.03
+assert paired["iln-surfaces", "iou"][0] > 3 * paired["iln-surfaces", "iou"][1]
+assert alone > 2 * paired["iln-surfaces", "iou"][1]
 
 # %% [markdown]
 # *In words: left, means of seven methods with long error bars that mostly overlap. Middle and right, differences to iln
-# on the same scans, as dots with mean and error bar. In IoU iln-prior and planes lie clearly above zero, liif far
-# below, and the bars are short. In MAE bilinear and planes lie above zero with long bars, and iln-prior sits on the
-# zero line.*
+# on the same scans, as dots with mean and error bar. In IoU iln-surfaces and planes lie clearly above zero, liif far
+# below, and the bars are short. In MAE bilinear and planes lie above zero with long bars, and iln-surfaces is closer to
+# the zero line.*
 #
 # Scans differ more than methods: a scan of a village with trees all around is hard for everybody. On the *same* scans
-# this common part cancels. So the IoU says yes, clearly, and by MAE the two are a tie: their difference is half a
-# centimetre, less than its standard error.
+# this common part cancels. So the IoU says yes, clearly. Ask the same of the MAE: by how many of its standard errors do
+# the two differ there?
 #
-# A paired difference does not say *why*. Here it is mostly the snapping to planes: plain `iln`, once it snaps as well,
-# is as far ahead of `iln` as the last but one line printed says.
+# A paired difference does not say *why*. These two networks differ in what they weigh, in their loss, and in the
+# sensors and the steps of their training. Only trainings that differ in one of these tell which of them it was.
 #
 # And a standard error says how sure you are of the mean over **scans like these**. It does not know that each network
 # was trained once: another seed gives other weights, and another difference. That spread only more trainings show.
@@ -786,12 +781,13 @@ def steps_to_reach(steps, values, target):  # trusts the order
 # %% [markdown]
 # ## 6. In and out of distribution
 #
-# The networks were trained on one input: 16 beams over ±15°, 2° apart, in six towns. The queries of their training were
-# rays at *continuous* directions between those beams. So any **output** size is in distribution: 64x1024, 128x2048 and
-# 50x777 are all samples of the same directions. Out of distribution are
+# `liif` and `iln` were trained on one input: 16 beams over ±15°, 2° apart, in six towns. The queries of their training
+# were rays at *continuous* directions between those beams. So any **output** size is in distribution: 64x1024, 128x2048
+# and 50x777 are all samples of the same directions. Out of distribution are
 #
-# - another **spacing** of the input's beams. The networks see offsets in pixels and do not know how many degrees a
-#   pixel is: 16 beams over ±7.5°, over ±21° (2.8° apart), over ±30° (4° apart);
+# - another **spacing** of the input's beams. These networks see offsets in pixels and do not know how many degrees a
+#   pixel is: 16 beams over ±7.5°, over ±21° (2.8° apart), over ±30° (4° apart). `iln-surfaces` knows it, and has been
+#   trained on many spacings;
 # - another **world**: a hall with pillars and shelves. There is no sky in it, and a ceiling, which no town has.
 #
 # **Predict:** for whom is the wide field of view worse, for LIIF or for ILN? And in the hall?
@@ -872,28 +868,27 @@ trained, odd, narrow, _, widest, room = conditions
 for found in beyond.values():
     assert abs(found[odd] - found[trained]) < 0.02
 for condition in conditions:
-    ahead = min(beyond[name][condition] for name in ("planes", "iln-prior"))
+    ahead = min(beyond[name][condition] for name in ("planes", "iln-surfaces"))
     order = [ahead, *(beyond[name][condition] for name in ("iln", "bilinear", "liif"))]
     assert order == sorted(order, reverse=True)
 assert beyond["bilinear"][narrow] - beyond["bilinear"][trained] > 0.04
 assert beyond["liif"][trained] - beyond["liif"][narrow] > 0.03
 lost = {name: found[trained] - found[widest] for name, found in beyond.items()}
-assert lost["iln"] > max(lost["iln-prior"], lost["planes"])
+assert lost["iln"] > lost["planes"]
 kept = {name: found[room] / found[trained] for name, found in beyond.items()}
-assert kept["liif"] < min(kept[name] for name in ("iln", "iln-prior", "planes"))
-assert max(kept[name] for name in ("iln", "iln-prior", "planes")) < kept["bilinear"]
+assert kept["liif"] < min(kept[name] for name in ("iln", "iln-surfaces", "planes"))
+assert max(kept[name] for name in ("iln", "planes")) < kept["bilinear"]
 
 # %% [markdown]
 # *In words: two panels with the six conditions side by side, each method a marker. The order is the same in all six:
-# planes and iln-prior close together, then iln, bilinear, liif. From "as trained" to "narrow" the markers of bilinear,
-# planes and iln-prior go up, that of iln stays, and that of liif falls. At "very wide" iln comes down most. In the hall
-# planes, iln-prior and iln lie closer to bilinear, and liif lies farther below it than as trained.*
+# planes and iln-surfaces on top, then iln, bilinear, liif. From "as trained" to "narrow" the markers of bilinear, planes
+# and iln-surfaces go up, that of iln stays, and that of liif falls. At "very wide" iln comes down more than planes. In
+# the hall planes and iln lie closer to bilinear, and liif lies farther below it than as trained.*
 #
 # - **Another output size costs nothing**, as it should.
-# - **A narrow field of view is an easier task**: neighbours are closer together, and the rules and `iln-prior` gain.
+# - **A narrow field of view is an easier task**: neighbours are closer together, and the rules and `iln-surfaces` gain.
 #   LIIF *loses*: presumably it has learned how far ranges run apart within one pixel of 2°, and predicts that still.
-# - **A very wide one is harder for everybody**, and ILN loses most. Geometry holds `iln-prior` up: its answers snap to
-#    planes.
+# - **A very wide one is harder for everybody**, and ILN loses much. Geometry holds `planes` and `iln-surfaces` up.
 # - **The hall is another world**, and the order survives. Every margin over bilinear shrinks, also that of
 #   `planes`, which has learned nothing: in part the hall is just a good place for bilinear. Of what it had, LIIF loses
 #   most.
@@ -921,22 +916,20 @@ assert float(largest["iln"]["iou"]) > float(largest["liif"]["iou"])
 #
 # 1. **Weights are ahead of values in IoU.** At three sizes, from the first steps on, with three seeds, in each of six
 #    conditions above, and in the paper. Believe it.
-# 2. **A rule made of planes has the largest IoU at the larger sizes.** Also solid, and it says as much about the
-#    measure and the towns as about the rule: most voxels lie on planes. Where leaves and people matter, ask for other
-#    measures.
+# 2. **A rule made of planes is ahead of `iln` in IoU.** Also solid, and it says as much about the measure and the towns
+#    as about the rule: most voxels lie on planes. Where leaves and people matter, ask for other measures.
 # 3. **The networks have the smallest MAE.** Solid on these towns; and it is what their loss asks for.
-# 4. **`iln-prior` over `iln` in IoU.** Solid, a paired difference of many standard errors. But nearly all of it comes
-#    from snapping to planes, which plain `iln` could do as well.
-# 5. **`iln-prior` against `iln` in MAE.** A tie.
-# 6. **The size of any gap after a long training.** Unknown. 6000 steps are a few thousandths of the paper's budget, and
+# 4. **`iln-surfaces` over `iln` in IoU.** Solid, a paired difference of many standard errors. But these tables do not
+#    say what it comes from.
+# 5. **The size of any gap after a long training.** Unknown. 6000 steps are a few thousandths of the paper's budget, and
 #    LIIF may gain more from a longer one than ILN, which starts ahead. The paper's own gap, with its full budget, is
 #    .329 to .258.
-# 7. **Digits after the second.** Voxel boundaries, the choice of 0.1 m, and how many metres a no return costs move
+# 6. **Digits after the second.** Voxel boundaries, the choice of 0.1 m, and how many metres a no return costs move
 #    them.
 #
-# Two habits keep a table honest. Nothing was *chosen* on the test towns: not the number of steps, not the prior, not
-# the learning rate. And rules without training stand in it: had `planes` been left out, the networks would look like
-# winners of everything.
+# Two habits keep a table honest. Nothing was *chosen* on the test towns: not the number of steps, not the loss, not
+# the learning rate. And rules without training stand in it: had `planes` been left out, nobody would see how much of an
+# IoU flat ground gives away.
 
 # %% [markdown]
 # ### Exercise 4 · An IoU without boundaries
@@ -1054,8 +1047,8 @@ def shifted_iou(predicted, true, count):  # the union of all grids is not their 
 #
 # 1. MAE in metres is ruled by a few pixels at far edges, voxel IoU by centimetres on flat surfaces. They can disagree,
 #    and each is nearly blind to what the other one measures.
-# 2. Networks that predict weights are ahead of the one that predicts values. They have the smallest errors; in IoU a
-#    rule made of planes keeps up with them, or is ahead.
+# 2. Networks that predict weights are ahead of the one that predicts values, and have the smallest errors. In IoU a rule
+#    made of planes is ahead of `iln`, and the network that weighs surfaces is ahead of both.
 # 3. Differences on the same scans are far less noisy than means. What several trainings would say, they do not tell.
 # 4. Another output size is in distribution; another spacing of beams and another world are not, and the order held
 #    there too.
