@@ -7,6 +7,7 @@ from pathlib import Path
 from tqdm import tqdm  # type: ignore[import-untyped]
 
 from ilnet import models, scan_files
+from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 from ilnet.world import simulate
 
@@ -65,7 +66,9 @@ def run(
                 wanted = target if isinstance(target, Sensor) else scan.sensor.resize(*target)
                 frames = models.Upsampler(model, scan.sensor, wanted, device=device)
             dense = frames(scan)
-            scan_files.write(result, dense if min_confidence is None else dense.confident(min_confidence))
+            if min_confidence is not None:
+                dense = _confident(dense, min_confidence)
+            scan_files.write(result, dense)
             written.add(result)
         except (ValueError, OSError) as error:
             failed += 1
@@ -74,6 +77,15 @@ def run(
                 line += ": --from NAME"
             tqdm.write(f"error: {line if line.startswith(str(path)) else f'{path}: {line}'}", file=sys.stderr)
     return len(written), failed
+
+
+def _confident(scan: Scan, least: float) -> Scan:
+    """Returns `scan.confident(least)`, or raises a ValueError if that is empty: no command would read it."""
+    found = scan.confident(least)
+    if scan.confidence is not None and not found.ranges.any():
+        largest = scan.confidence.max()
+        raise ValueError(f"none of its returns has a confidence of {least}; the largest is {largest:.2f}")
+    return found
 
 
 def _tasks(source: Path, out: Path, suffix: str) -> Iterator[tuple[Path, Path]]:

@@ -1,5 +1,7 @@
 """The command `upsample`, in this process."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -120,6 +122,59 @@ def test_bad_input_is_one_line_and_exit_code_2(run, seen, tmp_path, arguments, m
     assert (code, out) == (2, "")
     assert message in error
     assert (tmp_path / "in.npz").read_bytes() == before
+
+
+@pytest.fixture
+def surfaces(tmp_path):
+    """A file of weights that tell a confidence."""
+    torch.manual_seed(0)
+    arguments = {"features": 16, "blocks": 1}
+    model = models.create("iln-surfaces", **arguments)
+    torch.nn.init.normal_(model.head[1].weight, std=0.5)
+    models.save(model, tmp_path / "small.safetensors", "iln-surfaces", arguments)
+    return "small.safetensors"
+
+
+def test_only_what_the_model_trusts_is_written(run, seen, surfaces, tmp_path):
+    options = ("--size", "16x256", "--model", surfaces)
+    assert run("in.npz", "all.npz", *options)[0] == 0
+    whole = scan_files.read(tmp_path / "all.npz")
+    least = float(whole.confidence[whole.ranges > 0].median())
+    assert run("in.npz", "some.npz", *options, "--min-confidence", least)[0] == 0
+    some = scan_files.read(tmp_path / "some.npz")
+    trusted = whole.confidence >= least
+    assert 100 < trusted.sum() < (whole.ranges > 0).sum() - 100
+    assert torch.equal(some.ranges, whole.ranges.where(trusted, 0.0))
+    assert torch.equal(some.confidence, whole.confidence.where(trusted, 0.0))
+
+
+def test_a_scan_that_would_be_empty_is_not_written(run, seen, surfaces, tmp_path):
+    code, _, [error] = run("in.npz", "out.npz", "--size", "16x256", "--model", surfaces, "--min-confidence", 1)
+    assert code == 2
+    assert re.fullmatch(r"error: in.npz: none of its returns has a confidence of 1.0; the largest is 0\.\d\d", error)
+    assert not (tmp_path / "out.npz").exists()
+
+
+def test_intensity_goes_along(run, seen, tmp_path):
+    scan_files.write(tmp_path / "in.npz", Scan(seen.ranges, SENSOR, torch.full(SENSOR.shape, 0.4)))
+    assert run("in.npz", "out.pcd", "--size", "16x256", "--model", "planes")[0] == 0
+    dense = scan_files.read(tmp_path / "out.pcd", SENSOR.resize(16, 256))
+    torch.testing.assert_close(dense.intensity, (dense.ranges > 0) * 0.4)
+
+
+@pytest.mark.parametrize(
+    ("model", "value", "message"),
+    [
+        ("small.safetensors", "1.5", "--min-confidence is 1.5; it should be from 0 to 1"),
+        ("small.safetensors", "nan", "--min-confidence is nan; it should be from 0 to 1"),
+        ("small.safetensors", "half", "Invalid value for '--min-confidence': 'half' is not a valid float."),
+        ("planes", "0.5", "--min-confidence needs a model that tells its confidence, such as --model iln-surfaces"),
+    ],
+)
+def test_a_bad_confidence_is_one_line_before_anything_is_written(run, seen, surfaces, tmp_path, model, value, message):
+    options = ("--size", "16x256", "--model", model, "--min-confidence", value)
+    assert run("in.npz", "new/out.npz", *options) == (2, "", [f"error: {message}"])
+    assert not (tmp_path / "new").exists()
 
 
 def test_an_uneven_sensor_keeps_its_field_of_view(run, tmp_path, yard):

@@ -212,6 +212,124 @@ def test_upsample_to_any_sensor(name, yard):
         assert dense.ranges.max() <= target.max_range
 
 
+# Intensity and confidence of upsampled scans
+
+
+def any_model(name):
+    torch.manual_seed(0)
+    return models.create(name, **{"features": 16, "blocks": 1} if name in models.TRAINABLE else {}).eval()
+
+
+def painted(yard, sensor, **arguments):
+    """A scan of the yard with an intensity drawn at random."""
+    scan = simulate.scan(yard, sensor, pose((0.0, 0.0, 1.8)))
+    intensity = torch.rand(sensor.shape, generator=torch.Generator().manual_seed(0))
+    return replace(scan, intensity=intensity, **arguments)
+
+
+NAMED = ("nearest", "bilinear", "planes", "liif", "iln", "iln-surfaces")
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_an_even_intensity_stays_even_beside_what_does_not_return(name, yard):
+    scan = simulate.scan(yard, preset("paper-16x1024"), pose((0.0, 0.0, 1.8)))
+    lost = torch.rand(scan.ranges.shape, generator=torch.Generator().manual_seed(0)) < 0.3
+    ranges = scan.ranges.masked_fill(lost, 0.0)
+    target = preset("os1-128")  # rays out of view as well
+    dense = any_model(name).upsample(Scan(ranges, scan.sensor, torch.full(ranges.shape, 0.7)), target)
+    returned = dense.ranges > 0
+    assert 0.1 < returned.float().mean() < 0.75
+    assert not dense.intensity[~returned].any()
+    # An untrained LIIF predicts ranges also where none of the neighbours returned.
+    queries = scan.sensor.grid_queries(target).view(1, -1, 2)
+    near = reference.gather_neighbours(ranges[None, None], queries, True)[0].amax((0, 2, 3)).view(target.shape)
+    torch.testing.assert_close(dense.intensity[returned], (near[returned] > 0) * 0.7, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_ranges_do_not_depend_on_the_intensity(name, yard):
+    model, scan, target = any_model(name), painted(yard, preset("paper-16x1024")), preset("paper-64x1024")
+    dense, plain = model.upsample(scan, target), model.upsample(Scan(scan.ranges, scan.sensor), target)
+    assert torch.equal(dense.ranges, plain.ranges)
+    assert plain.intensity is None
+    assert (dense.confidence is None) == (plain.confidence is None) == (not model.tells_confidence)
+    assert dense.intensity.shape == target.shape
+
+
+@pytest.mark.parametrize("name", ["planes", "iln-surfaces"])
+def test_intensity_is_that_of_the_surface_that_is_met(name):
+    """A bright pole before a dark wall: what is met at one of the two ranges has its intensity."""
+    sensor = preset("paper-16x1024").resize(8, 90)
+    ranges = torch.full(sensor.shape, 40.0)
+    ranges[:, 43:46] = 5.0
+    scan = Scan(ranges, sensor, torch.where(ranges < 10, 0.9, 0.1))
+    dense = any_model(name).upsample(scan, sensor.resize(20, 300))
+    for range_, expected in ((5.0, 0.9), (40.0, 0.1)):
+        met = (dense.ranges - range_).abs() < 0.5
+        assert met.sum() > 100
+        assert (dense.intensity[met] - expected).abs().max() < 0.01
+
+
+@torch.no_grad()
+def test_support_weights_the_intensity(yard):
+    model, scan, target = surfaces(), painted(yard, preset("paper-16x1024")), preset("paper-64x1024")
+    queries, image = scan.sensor.grid_queries(target).view(1, -1, 2), scan.filled().unsqueeze(0)
+    answer = model.answer(model.encode(image, True, scan.sensor), image, queries, True)
+    near = reference.gather_neighbours(scan.intensity[None, None], queries, True)[0].squeeze(-1)
+    expected = (answer.support * near).sum(-1) / answer.support.sum(-1)
+    dense = model.upsample(scan, target)
+    met = dense.ranges > 0
+    torch.testing.assert_close(dense.intensity[met], expected.view(target.shape)[met], rtol=0, atol=1e-4)
+    torch.testing.assert_close(dense.confidence[met], answer.confidence.view(target.shape)[met], rtol=0, atol=1e-5)
+    assert dense.confidence[met].min() > 0
+    assert not dense.confidence[~met].any()
+
+
+@pytest.mark.parametrize("name", ["planes", "iln-surfaces"])
+def test_intensity_and_confidence_do_not_depend_on_the_chunk(name, yard, monkeypatch):
+    model, scan, target = any_model(name), painted(yard, preset("paper-16x1024")), preset("paper-64x1024")
+    expected = model.upsample(scan, target)
+    monkeypatch.setitem(base._TILE, "cpu", 777)
+    found = model.upsample(scan, target)
+    torch.testing.assert_close(found.intensity, expected.intensity, rtol=0, atol=1e-5)
+    assert name == "planes" or torch.allclose(found.confidence, expected.confidence, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["planes", "iln-surfaces"])
+def test_intensity_meets_itself_at_the_seam(name, yard):
+    model, sensor = any_model(name), preset("paper-16x1024").resize(16, 64)
+    scan, between = painted(yard, sensor), replace(sensor, azimuths=sensor.azimuths + np.pi / 64)
+    turned = Scan(scan.ranges.roll(20, -1), sensor, scan.intensity.roll(20, -1))
+    found, expected = model.upsample(turned, between), model.upsample(scan, between)
+    same = (found.ranges.roll(-20, -1) - expected.ranges).abs() < METRES
+    assert same.float().mean() > 0.99  # a median may jump
+    assert same[:, -1].all()
+    off = (found.intensity.roll(-20, -1) - expected.intensity).abs()
+    assert off[same].max() < 1e-3
+    assert expected.intensity[:, -1].any()
+
+
+@pytest.mark.parametrize("name", ["planes", "iln-surfaces"])
+@pytest.mark.parametrize("span", [360, 90])
+@pytest.mark.parametrize("flips", [(0,), (1,), (0, 1)])
+def test_intensity_is_flipped_as_ranges_are(name, span, flips, yard):
+    source = Sensor(np.deg2rad(np.linspace(-15, 15, 16)), np.deg2rad(np.arange(-span / 2, span / 2, 1.5)))
+    model, scan, target = any_model(name), painted(yard, source), preset("paper-64x1024")
+
+    def flip(sensor):
+        tables = [t[::-1].copy() if i in flips else t for i, t in enumerate((sensor.elevations, sensor.azimuths))]
+        return replace(sensor, elevations=tables[0], azimuths=tables[1])
+
+    expected = model.upsample(scan, target)
+    turned = Scan(scan.ranges.flip(flips), flip(source), scan.intensity.flip(flips))
+    for found in (model.upsample(turned, target), model.upsample(turned, flip(target))):
+        images = [(getattr(found, of), getattr(expected, of)) for of in ("ranges", "intensity", "confidence")]
+        for image, exact in images[: 3 if model.tells_confidence else 2]:
+            exact = exact.flip(flips) if found.sensor == flip(target) else exact
+            assert ((image - exact).abs() < METRES).float().mean() > 0.999  # a median may jump
+    assert (expected.ranges[:, ::64] > 0).any(0).sum() == (16 if span == 360 else 4)
+
+
 @pytest.mark.parametrize("flips", [(0,), (1,), (0, 1)])
 def test_networks_see_every_sensor_upright(flips, yard):
     """Ouster and Velodyne store the highest beam first; networks were trained with the lowest first."""
@@ -466,6 +584,24 @@ def test_on_cuda_frames_replay_a_graph_without_waiting(precision, yard):
         upsampler.ranges(scans[0])
     with pytest.raises(ValueError, match=r"model is on cuda:\d; it should be on cpu"):
         model.ranges(scans[0], target)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("name", ["planes", "iln-surfaces"])
+def test_on_cuda_intensity_and_confidence_are_those_of_the_cpu(name, yard):
+    model, source, target = any_model(name), preset("paper-16x1024"), preset("paper-64x1024")
+    scan = painted(yard, source)
+    expected = model.upsample(scan, target)
+    upsampler = models.Upsampler(model.cuda(), source, target, device="cuda")
+    for _ in range(3):  # answered straight away, recorded, replayed
+        for bright in (True, False):
+            found = upsampler((scan if bright else Scan(scan.ranges, source)).to("cuda")).to("cpu")
+            same = (found.ranges - expected.ranges).abs() < METRES
+            assert same.float().mean() > 0.99  # a median may jump
+            assert (found.intensity is None) == (not bright)
+            for of in ("intensity", "confidence"):
+                if getattr(found, of) is not None:
+                    assert (getattr(found, of) - getattr(expected, of))[same].abs().max() < 1e-3
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
