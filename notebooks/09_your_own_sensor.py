@@ -473,8 +473,9 @@ def cleaned(image, low, high, unit=1.0):  # in place
 #
 # *Zero-shot* means: on a sensor that nobody trained for. `evaluate.scan_pair` reads a file, keeps some of its beams,
 # and returns the thinned scan and the whole one. This needs no ground truth besides the scan itself. None of our
-# networks has seen this sensor: its 16 kept beams are 3° apart instead of 2°, over ±22.5° instead of ±15°, with noise
-# and holes.
+# networks has seen this sensor. To `liif` and `iln` all of it is new: its 16 kept beams are 3° apart instead of 2°,
+# over ±22.5° instead of ±15°, with noise and holes. `iln-surfaces` has learned with noise and holes, on sensors that
+# were made up.
 #
 # **Predict:** which measure can you no longer use as it stands, when a sixth of the pixels of the "truth" have no
 # return, and nobody knows whether that is sky or a lost pulse?
@@ -498,7 +499,8 @@ for name, f in judged.items():
         f"{f['median']:23.3f}"
     )
 if FILE is None:
-    assert min(judged[name]["iou"] for name in ("planes", "iln-surfaces")) > judged["iln"]["iou"] > judged["liif"]["iou"]
+    assert min(judged[name]["iou"] for name in ("planes", "iln-surfaces")) > judged["iln"]["iou"]
+    assert judged["iln"]["iou"] > judged["liif"]["iou"]
     assert judged["liif"]["iou"] < 0.5 * judged["bilinear"]["iou"]
     assert judged["iln"]["iou"] < judged["bilinear-inverse"]["iou"]
     assert judged["iln-surfaces"]["floating"] < 0.4 * judged["bilinear-inverse"]["floating"]
@@ -512,9 +514,9 @@ if FILE is None:
 #
 # `liif` suffers most. It was trained on rays without noise and holes, and each of the values that it makes up depends
 # on all pixels around. What blends measured ranges keeps the good ones. But `iln`, level with `bilinear-inverse` in
-# notebook 08, is now level with `bilinear`, and `iln-prior`, which snaps to planes, is hardly ahead of
-# `bilinear-inverse`. What is left are the edges: a third of the floating points of the bilinear blends. `planes` is
-# ahead in all but the MAE. Section 6 looks at holes and at wide gaps one by one.
+# notebook 08, is now level with `bilinear`. What is left to it are the edges: a third of the floating points of the
+# bilinear blends. `planes` and `iln-surfaces` are ahead in all but the MAE. Section 6 looks at holes and at wide gaps
+# one by one.
 #
 # That was simulated. Frames of real Ouster sensors were measured in the same way, and their figures are committed with
 # the package:
@@ -631,14 +633,14 @@ for name, found in suffered.items():
     assert found[0] > repaired[name] > found[1] > found[2]
 assert suffered["liif"][1] < 0.35 * suffered["liif"][0]
 assert min(suffered[name][1] / suffered[name][0] for name in NAMES if name != "liif") > 0.65
-assert suffered["planes"][1] > 0.9 * suffered["planes"][0]
+assert all(suffered[name][1] > 0.9 * suffered[name][0] for name in ("planes", "iln-surfaces"))
 
 # %% [markdown]
 # With 5 % lost, $1 - 0.95^4 = 19\,\%$ of the queries have a hole among their neighbours. (Here they lie on columns, so
 # that a bilinear blend takes two of the four: 10 %. The networks look at all four.) `bilinear` loses an eighth of its
-# IoU, `bilinear-inverse` and `iln-prior` a sixth, `iln` a quarter. LIIF loses three quarters: a hole disturbs the
-# *features* of all pixels around it, and its values are made of features alone. `planes` loses least: to it a hole is
-# an edge like any other, on whose near side a plane goes on.
+# IoU, `bilinear-inverse` a sixth, `iln` a quarter. LIIF loses three quarters: a hole disturbs the *features* of all
+# pixels around it, and its values are made of features alone. `planes` loses little: to it a hole is an edge like any
+# other, on whose near side a plane goes on. So does `iln-surfaces`, which has learned with holes.
 #
 # So mend what is obvious before a network sees it: the few lines of `mended` bring a large part back. Better still,
 # train with holes (section 7).
@@ -646,8 +648,8 @@ assert suffered["planes"][1] > 0.9 * suffered["planes"][0]
 # %% [markdown]
 # ### Gaps that are too wide
 #
-# Networks do not know the angle between two rows. They have learned how a road's ranges grow from row to row when rows
-# are 2° apart. We put the sensor above an endless level plane, and pull its 16 beams apart.
+# `liif` and `iln` do not know the angle between two rows. They have learned how a road's ranges grow from row to row
+# when rows are 2° apart. We put the sensor above an endless level plane, and pull its 16 beams apart.
 #
 # **Predict:** which methods keep the plane flat, whatever the spacing?
 
@@ -673,7 +675,7 @@ for name in NAMES:
     rough[name] = [heights(name, half)[0].square().mean().sqrt().item() for half in halves]
     left.plot(
         [half / 7.5 for half in halves],
-        [100 * r for r in rough[name]],
+        [max(100 * r, 1e-3) for r in rough[name]],
         marker=MARKERS[name],
         color=COLOURS[name],
         label=name,
@@ -698,16 +700,17 @@ assert rough["planes"][2] < 0.3 * rough["iln"][2]
 assert rough["planes"][3] > 10 * rough["planes"][2]
 assert rough["bilinear-inverse"][3] < 0.005
 assert all(max(values[k] for values in rough.values()) == rough["bilinear"][k] for k in range(4))
-assert rough["iln-surfaces"][2] < 0.5 * rough["iln"][2]
+assert rough["iln-surfaces"][3] < 0.001
 
 # %% [markdown]
-# *In words: left, roughness by spacing on a logarithmic scale; all curves rise. bilinear-inverse stays at a fraction of
-# a centimetre, and iln-prior on it up to 4 degrees. planes does as well up to there, and jumps to ten centimetres at 6.
-# liif and iln rise to several centimetres, bilinear is the worst throughout. Right, height by distance with 4 degrees
-# between beams: bilinear sags between beams like a rope, by up to 12 cm; iln wavers by two; iln-prior is straight.*
+# *In words: left, roughness by spacing on a logarithmic scale. iln-surfaces lies at the bottom throughout, below a
+# millimetre. The other curves rise. bilinear-inverse stays at a fraction of a centimetre. planes does as well up to 4
+# degrees, and jumps to ten centimetres at 6. liif and iln rise to several centimetres, bilinear is the worst
+# throughout. Right, height by distance with 4 degrees between beams: bilinear sags between beams like a rope, by up to
+# 12 cm; iln wavers by two; iln-surfaces is straight.*
 #
-# Inverse ranges hardly care about the spacing. Learned habits do; `iln-prior` snaps to planes where it comes close to
-# them. Up to 4° what `iln` is off by is a matter of millimetres, though, against cubes of 10 cm: what wide gaps cost in
+# Inverse ranges hardly care about the spacing. Learned habits do. `iln-surfaces` continues inverse ranges by the true
+# angles of the beams, so that a plane stays a plane at any spacing. Up to 4° what `iln` is off by is a matter of millimetres, though, against cubes of 10 cm: what wide gaps cost in
 # IoU is lost to what they hide, and at edges. The rule of `planes` breaks in its own way: 6° apart, the last two beams
 # that meet the road do so at 11 m and at 34 m, and it takes the stretch between them for an edge.
 
@@ -955,11 +958,11 @@ for name, model in tried.items():
     for label, scan in (("as it is", there.decimate(16)), ("mended", mended(there.decimate(16)))):
         better[name, label] = metrics.compare(model.ranges(scan, measuring), there)["iou"]
     print(f"{name:>15}: IoU {better[name, 'as it is']:.3f}, with mended holes {better[name, 'mended']:.3f}")
-    assert better[name, "mended"] > better[name, "as it is"]
+    assert better[name, "mended"] > better[name, "as it is"] - 0.01
 
 # %% [markdown]
-# So few steps gain less than a hundredth, on a single scan, which notebook 08 taught us not to believe; mending holes
-# by hand gains two hundredths. A training worth its name takes thousands. You have all that it needs:
+# So few steps change about a hundredth at most, on a single scan, which notebook 08 taught us not to believe; mending
+# holes by hand gains as much. A training worth its name takes thousands. You have all that it needs:
 #
 # ```
 # python -m ilnet train iln-surfaces --preset laptop --out runs    # full size, hours on two cores, less on a GPU
@@ -979,8 +982,8 @@ for name, model in tried.items():
 # 2. A file of points does not know its sensor: count the points that find a pixel. Millimetres are noticed, a mirrored
 #    world is not; motion tells it.
 # 3. Beams that are held back judge a model on your own scans. Look at IoU and at pixels that returned, not at the MAE.
-# 4. Holes, noise and wide gaps are out of distribution: values break first, weights bend, and the rule `planes` bends
-#    least. Mend holes, and train with them.
+# 4. Holes, noise and wide gaps are out of distribution for networks that have not learned with them: values break first,
+#    weights bend, and the rule `planes` bends least. Mend holes, and train with them, as `iln-surfaces` was.
 #
 # ## Next
 #
