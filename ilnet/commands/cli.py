@@ -12,6 +12,8 @@ import click
 __all__ = ["main"]
 
 _SIZES = "16x1024,64x1024,128x2048,256x4096"
+# Those of `experiment.EXPERIMENTS`, which takes seconds to import.
+_EXPERIMENTS = "table", "convergence", "attention", "rays", "real", "surfaces", "confidence", "sensors", "all"
 
 
 class _Size(click.ParamType):
@@ -453,9 +455,10 @@ def towns(names: tuple[str, ...], out: Path) -> None:
 
 
 @cli.command()
-@click.argument("names", nargs=-1, type=click.Choice(["table", "convergence", "attention", "rays", "real", "all"]))
+@click.argument("names", nargs=-1, type=click.Choice(_EXPERIMENTS))
 @click.option(
-    "--preset", help="Preset of each training. By default small, and table and real use the networks that ship."
+    "--preset",
+    help="Preset of each training. By default small; table, real, confidence and sensors use the networks that ship.",
 )
 @click.option(
     "--out",
@@ -485,12 +488,13 @@ def experiment(
     if not names:
         raise click.UsageError("name some experiments, or all")
     from ilnet.commands import experiment
+    from ilnet.commands.study import Study
 
     chosen = tuple(experiment.EXPERIMENTS) if "all" in names else names
     for name, option, value in (("rays", "--data DIR", data), ("real", "--measured FILE", measured)):
         if name in chosen and not value:  # said before hours of training, not after
             raise click.UsageError(f"{name} needs {option}")
-    study = experiment.Study(preset, out, scans, seeds, data, measured)
+    study = Study(preset, out, scans, seeds, data, measured)
     for name in chosen:
         experiment.EXPERIMENTS[name](study)
         click.echo(experiment.results(study))

@@ -5,29 +5,25 @@ share their networks. Test scans come from towns 07 and 10, in which nothing is 
 """
 
 import csv
-import json
+import inspect
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from safetensors import safe_open
 
 from ilnet import data, models, scan_files
-from ilnet.commands import plot
-from ilnet.learning import evaluate, train
-from ilnet.scan import Pair
+from ilnet.commands import evidence, plot
+from ilnet.commands.study import COLOURS, SERIES, Study, grouped_bars, loaded, made_with
+from ilnet.learning import evaluate
 from ilnet.sensor import PAPER_INPUT, format_size
-from ilnet.world import simulate, towns
+from ilnet.world import towns
 
-__all__ = ["EXPERIMENTS", "Study", "results"]
+__all__ = ["EXPERIMENTS", "results"]
 
-SIZES = ((64, 1024), (128, 2048), (256, 4096))
 # The paper's Table II: MAE [m], IoU, precision, recall, F1 in CARLA's towns 07 and 10.
 PAPER = {
     "64x1024": {
@@ -50,114 +46,6 @@ PAPER = {
     },
 }
 
-# Distinguishable for the colour-blind, and in print.
-_SERIES = "#0072b2", "#e69f00", "#009e73", "#cc79a7"
-_COLOURS = {
-    "liif": "#d55e00",
-    "iln": "#0072b2",
-    "iln-surfaces": "#009e73",
-    "lidar-sr": "#cc79a7",
-    "bilinear": "#999999",
-}
-
-
-@dataclass(frozen=True)
-class Study:
-    """What experiments share.
-
-    Attributes:
-        preset: Preset of each training, one of `train.PRESETS`. If None, trainings are `small`, and other methods are
-            compared with the networks that ship with the package.
-        out: Folder for weights, numbers and figures.
-        scans: Number of test scans from each test town.
-        seeds: Number of trainings where their spread is shown.
-        archive: Stored images, to compare with continuous rays and to train LiDAR-SR at those of `SIZES` that it holds.
-            If None, both are left out.
-        measured: Files of measured scans. Their names without suffix differ, since results bear them.
-
-    Raises:
-        ValueError: If two measured files have one name.
-    """
-
-    preset: str | None
-    out: Path
-    scans: int = 20
-    seeds: int = 3
-    archive: Path | None = None
-    measured: tuple[Path, ...] = ()
-
-    def __post_init__(self) -> None:
-        files: dict[str, Path] = {}
-        for path in self.measured:
-            if (other := files.setdefault(path.stem, path)) is not path:
-                raise ValueError(f"measured holds {other} and {path}; their names should differ: rename one of them")
-
-    @cached_property
-    def probe(self) -> list[Pair]:
-        """Test scans that are measured during a training."""
-        output = PAPER_INPUT.resize(*SIZES[0])
-        return [pair for town in towns.TEST for pair in evaluate.town_pairs(town, 4, output)]
-
-    def trained(self, label: str, name: str, **options: Any) -> Path:
-        """Trains a network unless its weights exist; returns their file. Options are those of `train.train`."""
-        folder = self.out / "weights" / label
-        file = folder / f"{name}.safetensors"
-        if not file.exists():
-            train.train(name, self.preset or "small", folder, **options)
-        return file
-
-    def followed(self, name: str, seed: int = 0) -> Path:
-        """Returns the same for a network with the preset's own arguments, and logs test figures during training."""
-        return self.trained(f"{name}-{seed}", name, seed=seed, probe=self.probe)
-
-    def networks(self) -> dict[str, str | Path]:
-        """Returns the networks that are compared with other methods."""
-        return {name: self.trained(name, name) if self.preset else name for name in ("liif", "iln", "iln-surfaces")}
-
-    def compare(
-        self, files: Mapping[str, str | Path | models.Model], sizes: Sequence[tuple[int, int]] = ()
-    ) -> list[dict[str, Any]]:
-        """Measures models in the test towns, at all `SIZES` by default; their rows bear the names in `files`."""
-        loaded = _loaded(files)
-        rows = []
-        for size in sizes or SIZES:
-            output = PAPER_INPUT.resize(*size)
-            pairs = [pair for town in towns.TEST for pair in evaluate.town_pairs(town, self.scans, output)]
-            rows += evaluate.measure(loaded, pairs)
-        return rows
-
-    def _steps_of_lidar_sr(self) -> str:
-        files = {size[0]: self.out / "weights" / f"lidar-sr-{size[0]}" / "lidar-sr.safetensors" for size in SIZES}
-        steps = []
-        for rows, file in files.items():
-            if file.exists():
-                with safe_open(file, "pt") as weights:
-                    steps.append(f"{weights.metadata()['steps']} steps for {rows} rows")
-        return ", ".join(steps)
-
-    def write(self, name: str, rows: Sequence[dict[str, Any]]) -> None:
-        """Writes rows to NAME.csv, and to about.json what they were made with."""
-        self.out.mkdir(parents=True, exist_ok=True)
-        shipped = self.preset is None and name in ("table", "real")
-        trained = f"networks trained with preset {self.preset or 'small'}"
-        networks = "the networks that ship" if shipped else trained
-        if any(row.get("model") == "lidar-sr" for row in rows):
-            networks += f"; LiDAR-SR trained with preset {self.preset or 'small'}, {self._steps_of_lidar_sr()}"
-        about = _about(self.out) | {name: {"networks": networks}}
-        (self.out / "about.json").write_text(json.dumps(about, indent=1) + "\n")
-        with open(self.out / f"{name}.csv", "w", newline="") as file:
-            writer = csv.DictWriter(file, rows[0], lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(
-                {key: round(v, 4) if isinstance(v, float) else v for key, v in row.items()} for row in rows
-            )
-
-
-def _loaded(files: Mapping[str, str | Path | models.Model]) -> dict[str, models.Model]:
-    """Returns models where the scans of `evaluate` are."""
-    found = {label: file if isinstance(file, models.Model) else models.load(file) for label, file in files.items()}
-    return {label: model.to(simulate.best_device()) for label, model in found.items()}
-
 
 def table(study: Study) -> None:
     """The paper's Table II: all methods at three sizes."""
@@ -165,7 +53,7 @@ def table(study: Study) -> None:
     networks = study.networks()
     stored = data.open_archive(study.archive).sensors if study.archive else {}
     methods, rows = {}, []
-    for size in SIZES:
+    for size in study.sizes:
         lidar_sr = {}
         if format_size(size) in stored:
             file = study.trained(f"lidar-sr-{size[0]}", "lidar-sr", archive=study.archive, target=size)
@@ -174,9 +62,9 @@ def table(study: Study) -> None:
         rows += study.compare(methods[size], [size])
     study.write("table", rows)
     figure = Figure(figsize=(10, 3.2), layout="constrained")
-    for axis, (name, paper) in zip(figure.subplots(1, len(SIZES), sharey=True), PAPER.items(), strict=True):
+    for axis, (name, paper) in zip(figure.subplots(1, len(study.sizes), sharey=True), PAPER.items(), strict=True):
         found = {row["model"]: row["iou"] for row in rows if row["size"] == name}
-        axis.bar(list(found), list(found.values()), color=[_COLOURS.get(name, "#cccccc") for name in found])
+        axis.bar(list(found), list(found.values()), color=[COLOURS.get(name, "#cccccc") for name in found])
         theirs = {model: figures[1] for model, figures in paper.items() if model in found}
         axis.plot(list(theirs), list(theirs.values()), "k_", markersize=18, label="the paper, on CARLA")
         axis.set_title(name)
@@ -184,7 +72,7 @@ def table(study: Study) -> None:
     axis.legend(fontsize=8)
     figure.axes[0].set_ylabel("IoU")
     figure.savefig(study.out / "table.png", dpi=120)
-    _draw_points(study, SIZES[1], methods[SIZES[1]])
+    _draw_points(study, study.sizes[1], methods[study.sizes[1]])
 
 
 def _draw_points(study: Study, size: tuple[int, int], files: Mapping[str, str | Path]) -> None:
@@ -213,8 +101,8 @@ def convergence(study: Study) -> None:
             values = np.array([[run[step][y] for step in steps] for run in runs])
             at = np.mean([[run[step][x] for step in steps] for run in runs], axis=0)
             at = at / 60 if x == "seconds" else at
-            axis.plot(at, values.mean(0), {"liif": "--", "iln": "-"}[name], color=_COLOURS[name], label=name)
-            axis.fill_between(at, values.min(0), values.max(0), color=_COLOURS[name], alpha=0.25, linewidth=0)
+            axis.plot(at, values.mean(0), {"liif": "--", "iln": "-"}[name], color=COLOURS[name], label=name)
+            axis.fill_between(at, values.min(0), values.max(0), color=COLOURS[name], alpha=0.25, linewidth=0)
         axis.set_xlabel({"step": "step", "seconds": "minutes"}[x])
         axis.set_ylabel({"iou": "IoU", "mae": "MAE [m]"}[y])
     axis.set_yscale("log")
@@ -282,7 +170,7 @@ def attention(study: Study) -> None:
 
 
 def _frame_time(model: models.Model) -> float:
-    [(scan, truth)] = evaluate.town_pairs(towns.TEST[0], 1, PAPER_INPUT.resize(*SIZES[1]))
+    [(scan, truth)] = evaluate.town_pairs(towns.TEST[0], 1, PAPER_INPUT.resize(*Study.sizes[1]))
     device = scan.ranges.device
     frames = models.Upsampler(model.to(device), scan.sensor, truth.sensor, device=device)
     seconds = []
@@ -317,7 +205,7 @@ def _bars(study: Study, name: str, rows: Sequence[dict[str, Any]], by: str, titl
         for number, kind in enumerate(kinds):
             chosen = [row for row in rows if str(row[by]) == kind]
             at = np.arange(len(chosen)) + (number - (len(kinds) - 1) / 2) * 0.8 / len(kinds)
-            axis.bar(at, [row[key] for row in chosen], 0.8 / len(kinds), label=kind, color=_SERIES[number])
+            axis.bar(at, [row[key] for row in chosen], 0.8 / len(kinds), label=kind, color=SERIES[number])
         axis.set_xticks(range(len(chosen)), [row["size"] for row in chosen])
         axis.set_ylabel(words)
     axis.legend(title=title, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
@@ -330,26 +218,15 @@ def real(study: Study) -> None:
         raise ValueError("no measured scans are named: give some with --measured FILE, such as frames of your sensor")
     files: dict[str, str | Path] = {name: name for name in ("bilinear", "bilinear-inverse", "planes")}
     files |= study.networks()
-    loaded = _loaded(files)
+    compared = loaded(files)
     rows = []
     for path in study.measured:
         beams = scan_files.read(path).sensor.shape[0]
         for kept in [count for count in (8, 16, 32) if beams // 16 <= count < beams][-2:]:
             pair = evaluate.scan_pair(path, kept)
-            rows += [{"scan": path.stem, "beams": kept, **row} for row in evaluate.measure(loaded, [pair])]
+            rows += [{"scan": path.stem, "beams": kept, **row} for row in evaluate.measure(compared, [pair])]
     study.write("real", rows)
-    figure = Figure(figsize=(10, 3.4), layout="constrained")
-    axis = figure.subplots()
-    cases = list(dict.fromkeys((row["scan"], row["beams"]) for row in rows))
-    for number, name in enumerate(files):
-        values = [next(r["iou"] for r in rows if (r["scan"], r["beams"]) == c and r["model"] == name) for c in cases]
-        axis.bar(
-            np.arange(len(cases)) + 0.16 * (number - 2), values, 0.16, label=name, color=_COLOURS.get(name, "#555555")
-        )
-    axis.set_xticks(range(len(cases)), [f"{scan}\n{kept} beams" for scan, kept in cases], fontsize=6)
-    axis.set_ylabel("IoU")
-    axis.legend(fontsize=8)
-    figure.savefig(study.out / "real.png", dpi=120)
+    grouped_bars(study, "real", rows, [f"{row['scan']}\n{row['beams']} beams" for row in rows])
 
 
 EXPERIMENTS: dict[str, Callable[[Study], None]] = {
@@ -358,18 +235,21 @@ EXPERIMENTS: dict[str, Callable[[Study], None]] = {
     "attention": attention,
     "rays": rays,
     "real": real,
+    "surfaces": evidence.surfaces,
+    "confidence": evidence.confidence,
+    "sensors": evidence.sensors,
 }
 
 
 def results(study: Study) -> Path:
     """Writes RESULTS.md, with tables and figures of all experiments in the folder so far; returns its path."""
-    about = _about(study.out)
-    done = {name: _read(study.out / f"{name}.csv") for name in EXPERIMENTS if name in about}
+    made = made_with(study.out)
+    done = {name: _read(study.out / f"{name}.csv") for name in EXPERIMENTS if name in made}
     lines = ["# Results", "", "Ratios of figures on the test towns, and of IoU on measured scans:", ""]
     lines += _markdown(ratios(done))
     for name, rows in done.items():
-        lines += ["", f"## {name}", "", (EXPERIMENTS[name].__doc__ or "").strip(), ""]
-        lines += [f"Made with {about[name]['networks']}.", "", f"![{name}]({name}.png)", ""]
+        lines += ["", f"## {name}", "", inspect.getdoc(EXPERIMENTS[name]) or "", ""]
+        lines += [f"Made with {made[name]['networks']}.", "", f"![{name}]({name}.png)", ""]
         lines += _markdown(_shown(name, rows))
         if name == "table":
             lines += ["", *(f"![The same crop by every method, {town}](points-{town}.png)" for town in towns.TEST)]
@@ -382,7 +262,8 @@ def ratios(done: Mapping[str, Sequence[dict[str, Any]]]) -> list[dict[str, str]]
     """Returns one row for each ratio that the experiments are about, with the paper's beside ours.
 
     Args:
-        done: Rows of the experiments `table`, `convergence` and `real`, by name; those that were run.
+        done: Rows of the experiments `table`, `convergence`, `real`, `sensors` and `surfaces`, by name; those that were
+            run.
     """
     found: list[dict[str, str]] = []
 
@@ -403,17 +284,19 @@ def ratios(done: Mapping[str, Sequence[dict[str, Any]]]) -> list[dict[str, str]]
         figure = f"steps of liif to the IoU {reached['iou']:.3f} that iln has after {reached['iln_steps']}, over those"
         ours = "never in its budget" if math.isinf(reached["ratio"]) else f"{reached['ratio']:.1f}"
         found.append({"figure": figure, "the paper": "much more", "ours": ours})
-    real = {(row["model"], row["scan"], row["beams"], row["size"]): row for row in done.get("real", ())}
-    for model, *case in real:
-        if model == "iln-surfaces":
-            figure = f"IoU of iln-surfaces over planes, {case[0]}, {case[1]} beams -> {case[2]}"
-            add(figure, real[model, *case], real["planes", *case], "iou")
+    for experiment, by in (("real", "scan"), ("sensors", "sensor")):
+        cases = {(row["model"], row[by], row["beams"], row["size"]): row for row in done.get(experiment, ())}
+        for key, words in (("iou", "IoU"), ("mae", "MAE")):
+            for model, *case in cases:
+                if model == "iln-surfaces":
+                    figure = f"{words} of iln-surfaces over planes, {case[0]}, {case[1]} beams -> {case[2]}"
+                    add(figure, cases[model, *case], cases["planes", *case], key)
+    variants = evidence.means(done.get("surfaces", ()))
+    for variant, size in variants:
+        if variant in ("ranges", "L1", "mean", "one sensor", "one channel"):
+            figure = f"IoU of surfaces over that of its variant {variant}, {size}"
+            add(figure, variants["surfaces", size], variants[variant, size], "iou")
     return found
-
-
-def _about(folder: Path) -> dict[str, Any]:
-    file = folder / "about.json"
-    return dict(json.loads(file.read_text())) if file.exists() else {}
 
 
 def _read(file: Path) -> list[dict[str, Any]]:
@@ -422,10 +305,12 @@ def _read(file: Path) -> list[dict[str, Any]]:
 
 
 def _shown(name: str, rows: Sequence[dict[str, Any]]) -> Sequence[dict[str, Any]]:
-    """Returns the rows of an experiment that the page shows; of a convergence, those at its end."""
+    """Returns what the page shows of an experiment: of a convergence, its end; of several seeds, means and spans."""
     if name == "convergence":
         last = max(int(row["step"]) for row in rows)
         return [row for row in rows if int(row["step"]) == last]
+    if name == "surfaces":
+        return evidence.spans(rows)
     return _beside_the_paper(rows) if name == "table" else rows
 
 

@@ -24,22 +24,23 @@ __all__ = ["interval", "measure", "mesh_pairs", "scan_by_scan", "scan_pair", "su
 _FIGURES = ("mae", "iou", "precision", "recall", "f1", "floating", "edge_mae", "chamfer")
 
 
-def town_pairs(name: str, count: int, output: Sensor) -> list[Pair]:
+def town_pairs(name: str, count: int, output: Sensor, source: Sensor = PAPER_INPUT) -> list[Pair]:
     """Scans a town at evenly spread waypoints, each with its own traffic.
 
     Args:
         name: One of `towns.NAMES`.
         count: Number of waypoints.
         output: The sensor to predict.
+        source: The sensor to predict it from.
 
     Returns:
-        For each waypoint the scan of `PAPER_INPUT` and that of `output`.
+        For each waypoint the scan of `source` and that of `output`.
 
     Raises:
         ValueError: If there is no such town.
     """
     place = places.town(name, device=simulate.best_device())
-    return [(scan, truth) for scan, truth in places.held_out_scans(place, count, [PAPER_INPUT, output])]
+    return [(scan, truth) for scan, truth in places.held_out_scans(place, count, [source, output])]
 
 
 def mesh_pairs(path: Path, positions: Sequence[Sequence[float]], output: Sensor) -> list[Pair]:

@@ -28,7 +28,17 @@ from ilnet.scan import Pair
 from ilnet.sensor import PAPER_INPUT, PAPER_TARGET, Sensor, format_size, preset
 from ilnet.world import places, simulate, towns
 
-__all__ = ["PRESETS", "Preset", "Training", "learns_from_images", "train"]
+__all__ = [
+    "HELD_OUT_SCANS",
+    "HELD_OUT_SENSORS",
+    "PRESETS",
+    "VALIDATION",
+    "Preset",
+    "Training",
+    "held_out_pairs",
+    "learns_from_images",
+    "train",
+]
 
 # The sensor whose scans a training predicts when it is validated.
 VALIDATION = preset("paper-64x1024")
@@ -229,6 +239,23 @@ def train(
     return _run(plan, training, batches, scans, out, start)
 
 
+def held_out_pairs(kinds: Sequence[tuple[Sensor, Sensor, int]], device: torch.device) -> list[list[Pair]]:
+    """Scans the towns in which no network trains and on which all that is chosen is chosen, `HELD_OUT`.
+
+    Args:
+        kinds: The sensor of the input, the sensor to predict, and the number of scans in each town.
+        device: Device of the scans.
+
+    Returns:
+        For each kind the pairs of scans, town by town.
+    """
+    streets = [places.town(town, seed, device) for town, seed in HELD_OUT.items()]
+    return [
+        [(scan, truth) for place in streets for scan, truth in places.held_out_scans(place, count, [source, wanted])]
+        for source, wanted, count in kinds
+    ]
+
+
 def learns_from_images(name: str, preset_name: str) -> bool:
     """Returns whether a model with a preset can learn from stored images only."""
     return name == "lidar-sr" or (preset_name in PRESETS and PRESETS[preset_name].epochs > 0)
@@ -312,12 +339,7 @@ def _build(
     lightning.seed_everything(plan.seed, verbose=False)
     model = plan.make(**plan.arguments)
     samples = _samples(plan, start, part, device)
-    held_out = [
-        (scan, truth)
-        for place in (places.town(town, held_out_seed, device) for town, held_out_seed in HELD_OUT.items())
-        for source, wanted, count in _validation(plan)
-        for scan, truth in places.held_out_scans(place, count, [source, wanted])
-    ]
+    held_out = [pair for pairs in held_out_pairs(_validation(plan), device) for pair in pairs]
     halve_after = [epoch * plan.per_epoch for epoch in plan.size.halve_after]
     rate = min(plan.size.rate, RATES.get(plan.name, math.inf))
     training = Training(model, held_out, rate, halve_after, plan.run, probe)

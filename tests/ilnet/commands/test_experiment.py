@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from ilnet import data, models
-from ilnet.commands import experiment
+from ilnet.commands import cli, evidence, experiment, variants
+from ilnet.commands.study import Study
 from ilnet.learning import evaluate, metrics, train
 from ilnet.sensor import PAPER_INPUT, preset
 from ilnet.world import simulate
@@ -20,8 +21,8 @@ def study(tmp_path, monkeypatch, yard, quiet_place):
     """Experiments in the yard, with networks and budgets of a size for tests."""
     place = quiet_place([[3, 0, 0]])
 
-    def pairs(town, count, output):
-        return [tuple(simulate.scan(yard, sensor, pose((3.0, 0.0, 1.8))) for sensor in (PAPER_INPUT, output))] * count
+    def pairs(town, count, output, source=PAPER_INPUT):
+        return [tuple(simulate.scan(yard, sensor, pose((3.0, 0.0, 1.8))) for sensor in (source, output))] * count
 
     monkeypatch.setattr(simulate, "best_device", lambda: torch.device("cpu"))  # where the yard is
     monkeypatch.setattr(train.places, "town", lambda *args: place)
@@ -30,13 +31,13 @@ def study(tmp_path, monkeypatch, yard, quiet_place):
     monkeypatch.setattr(train, "HELD_OUT_SCANS", 1)
     monkeypatch.setattr(train, "VALIDATION", PAPER_INPUT)  # a quarter of the work of each validation
     monkeypatch.setattr(train, "VALIDATE_EVERY", (2, 2))
-    monkeypatch.setattr(experiment, "SIZES", ((16, 256), (32, 512)))
+    monkeypatch.setattr(Study, "sizes", ((16, 256), (32, 512)))
     tables = experiment.PAPER["64x1024"], experiment.PAPER["128x2048"]
     monkeypatch.setattr(experiment, "PAPER", dict(zip(("16x256", "32x512"), tables, strict=True)))
     monkeypatch.setattr(experiment.plot, "point_clouds", lambda scans, path, reach: path.write_bytes(b"drawn"))
     size = train.Preset(steps=4, blocks=1, crops=2, columns=32, queries=64, towns=("town01",))
     monkeypatch.setitem(train.PRESETS, "tiny", size)
-    return experiment.Study("tiny", tmp_path / "out", scans=1, seeds=2)
+    return Study("tiny", tmp_path / "out", scans=1, seeds=2)
 
 
 def rows(study, name):
@@ -109,7 +110,7 @@ def test_ablations_and_measured_scans(study, tmp_path, yard):
 
     frame = tmp_path / "frame.npz"
     scan_files.write(frame, simulate.scan(yard, preset("os1-32").resize(32, 256), pose((3.0, 0.0, 1.8))))
-    study = experiment.Study("tiny", study.out, 1, 1, measured=(frame,))
+    study = Study("tiny", study.out, 1, 1, measured=(frame,))
     for name in ("attention", "real"):
         experiment.EXPERIMENTS[name](study)
         assert (study.out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
@@ -119,7 +120,7 @@ def test_ablations_and_measured_scans(study, tmp_path, yard):
 
 
 def test_without_a_preset_the_networks_that_ship_are_compared(study, monkeypatch):
-    study = experiment.Study(None, study.out)
+    study = Study(None, study.out)
     assert study.networks() == {name: name for name in ("liif", "iln", "iln-surfaces")}
     trained = []
     monkeypatch.setattr(train, "train", lambda name, preset_name, *args, **kwargs: trained.append((name, preset_name)))
@@ -138,14 +139,68 @@ def test_lidar_sr_has_a_network_for_each_size_that_is_stored(study, tmp_path, mo
         models.save(models.create("bilinear"), folder / f"{name}.safetensors", "bilinear", {}, steps=7)
 
     monkeypatch.setattr(train, "train", fake)
-    monkeypatch.setattr(experiment, "SIZES", ((32, 512), (64, 1024)))
+    monkeypatch.setattr(Study, "sizes", ((32, 512), (64, 1024)))
     monkeypatch.setattr(experiment, "PAPER", dict.fromkeys(("32x512", "64x1024"), experiment.PAPER["32x512"]))
     monkeypatch.setattr(experiment.plot, "point_clouds", lambda scans, path, reach: drawn.append(list(scans)))
-    experiment.table(experiment.Study("tiny", study.out, 1, 1, archive=archive))
+    experiment.table(Study("tiny", study.out, 1, 1, archive=archive))
     assert asked[3:] == [("lidar-sr-64", "lidar-sr", archive, (64, 1024))]
     assert [row["size"] for row in rows(study, "table") if row["model"] == "lidar-sr"] == ["64x1024"]
     assert all("lidar-sr" in captions for captions in drawn)
     assert "LiDAR-SR trained with preset tiny, 7 steps for 64 rows." in experiment.results(study).read_text()
+
+
+def test_every_part_of_surfaces_is_taken_away_once_and_beside_them_stands_an_oracle(study, monkeypatch):
+    study = Study("tiny", study.out, 1, seeds=1)
+    monkeypatch.setattr(variants, "SIZE", {"features": 8, "blocks": 1, "tokens": 8, "heads": 2})
+    evidence.surfaces(study)
+    found = rows(study, "surfaces")
+    names = "surfaces", "mean", "ranges", "L1", "one sensor", "one channel"
+    trained = [(row["variant"], row["size"]) for row in found if row["seed"] == "0"]
+    assert sorted(trained) == sorted((name, size) for name in names for size in ("16x256", "32x512"))
+    oracle = {row["variant"]: float(row["iou"]) for row in found if not row["seed"] and row["size"] == "32x512"}
+    assert oracle["oracle: best of 4 ranges"] < oracle["oracle: best of 36 surfaces"]
+    assert len(list((study.out / "weights").iterdir())) == 5  # the mean is another answer of the same weights
+    assert (study.out / "surfaces.png").read_bytes()[:4] == b"\x89PNG"
+    page = experiment.results(study).read_text()
+    assert "| IoU of surfaces over that of its variant ranges, 16x256 |" in page
+    assert "| oracle: best of 36 surfaces | 32x512 |" in page
+
+
+def test_means_and_spans_by_hand():
+    seeds = [{"variant": "L1", "size": "64x1024", "iou": str(v), "mae": "2", "floating": "0.1"} for v in (0.3, 0.5)]
+    assert evidence.means(seeds) == {("L1", "64x1024"): {"iou": pytest.approx(0.4), "mae": 2.0, "floating": 0.1}}
+    assert evidence.spans(seeds)[0]["iou"] == "0.400 (0.300 to 0.500)"
+    assert evidence.spans(seeds[:1])[0]["iou"] == "0.300"
+
+
+def test_confidence_and_other_sensors(study, monkeypatch):
+    monkeypatch.setattr(train, "HELD_OUT_SENSORS", ("os1-32",))
+    monkeypatch.setattr(train, "VALIDATION", PAPER_INPUT.resize(32, 256))
+    monkeypatch.setattr(evidence, "_SENSORS", (preset("vlp-16"), preset("paper-16x1024")))
+    file = study.out / "small.safetensors"
+    arguments = {"features": 8, "blocks": 1, "tokens": 8, "heads": 2}
+    models.save(models.create("iln-surfaces", **arguments), file, "iln-surfaces", arguments)
+    monkeypatch.setattr(Study, "networks", lambda self: {"liif": "bilinear", "iln": "nearest", "iln-surfaces": file})
+    for name in ("confidence", "sensors"):
+        experiment.EXPERIMENTS[name](study)
+        assert (study.out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+    found = rows(study, "confidence")
+    assert [(row["sensor"], row["size"]) for row in found] == [("paper", "32x256"), ("os1-32", "32x1024")]
+    for row in found:
+        assert 0 <= float(row["calibration error"]) < 1
+        assert float(row["recall of the rest"]) <= float(row["recall"])
+    found = rows(study, "sensors")
+    assert [(row["sensor"], row["beams"], row["model"]) for row in found] == [
+        (sensor, "8", model) for sensor in ("vlp-16", "paper-16x1024") for model in ("planes", "iln", "iln-surfaces")
+    ]
+    assert (
+        "| MAE of iln-surfaces over planes, paper-16x1024, 8 beams -> 16x1024 |"
+        in experiment.results(study).read_text()
+    )
+
+
+def test_the_command_knows_every_experiment(study):
+    assert (*experiment.EXPERIMENTS, "all") == cli._EXPERIMENTS
 
 
 def test_ratios_by_hand():
@@ -183,7 +238,7 @@ def test_what_is_missing_is_named(study):
 def test_two_measured_files_of_one_name_are_refused_before_any_training(tmp_path, command):
     files = [tmp_path / folder / "frame.npz" for folder in ("a", "b")]
     with pytest.raises(ValueError, match=r"measured holds .*a/frame.npz and .*b/frame.npz; their names should differ"):
-        experiment.Study(None, tmp_path, measured=tuple(files))
+        Study(None, tmp_path, measured=tuple(files))
     code, out, [error] = command("experiment", "convergence", "real", "--measured", files[0], "--measured", files[1])
     assert (code, out) == (2, "")
     assert "their names should differ" in error
@@ -205,7 +260,7 @@ def test_networks_go_where_the_scans_are(tmp_path, monkeypatch):
     monkeypatch.setattr(experiment.plot, "point_clouds", lambda *_, **options: None)
     experiment._frame_time(model)
     model.to_empty(device="cpu")
-    experiment._draw_points(experiment.Study(None, tmp_path), (64, 1024), {"iln": "iln"})
+    experiment._draw_points(Study(None, tmp_path), (64, 1024), {"iln": "iln"})
     assert set(seen) == {("meta", "meta")}
 
 
@@ -213,5 +268,5 @@ def test_the_page_that_ships_is_the_one_that_its_numbers_make(tmp_path):
     shipped = Path(experiment.__file__).parents[1] / "results"
     for file in (shipped / "about.json", *shipped.glob("*.csv")):
         shutil.copy(file, tmp_path)
-    page = experiment.results(experiment.Study(None, tmp_path))
+    page = experiment.results(Study(None, tmp_path))
     assert page.read_text() == (shipped / "RESULTS.md").read_text()
