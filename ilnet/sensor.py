@@ -228,6 +228,11 @@ class Sensor:
         """Returns the same sensor with its lowest beam first and its azimuths rising, as networks see it."""
         return replace(self, elevations=np.sort(self.elevations), azimuths=np.sort(self.azimuths))
 
+    def flips(self) -> list[int]:
+        """Returns the axes of images (..., H, W), among -2 and -1, that turn around where `upright` turns a table."""
+        tables = {-2: self.elevations, -1: self.azimuths}
+        return [axis for axis, table in tables.items() if table[0] > table[-1]]
+
     def decimation(self, rows: int | None = None, columns: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Returns the numbers of the rows and columns that `decimate` keeps.
 

@@ -16,6 +16,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from ilnet.data.archive import Archive
 from ilnet.data.random_sensors import COLUMNS, draw_effects, draw_sensor
 from ilnet.data.rimg import RangeImageTree
+from ilnet.scan import Scan
 from ilnet.sensor import Sensor, angles_to_directions
 from ilnet.world import simulate
 from ilnet.world.effects import nearer, spoil
@@ -180,6 +181,8 @@ class ContinuousRays(IterableDataset):
 class StoredImages(IterableDataset):
     """Endless batches of stored scans and of pixels of denser images from the same places (paper, Sec. III-A).
 
+    Images are turned upright, as `Upsampler` shows them to a network: lowest beam first, azimuths rising.
+
     Args:
         archive: See `open_archive`.
         source: Size of the input, such as "16x1024".
@@ -212,7 +215,7 @@ class StoredImages(IterableDataset):
         for size in (source, target):
             if size not in archive.sensors:
                 raise ValueError(f"{archive.path}: holds no scans of size {size}; it has {', '.join(archive.sizes)}")
-        sensor, dense = archive.sensors[source], archive.sensors[target]
+        sensor, dense = (archive.sensors[size].upright() for size in (source, target))
         self.times, rest = divmod(dense.shape[1], sensor.shape[1])
         if sector is not None and rest:
             raise ValueError(f"target is {target}; for a sector its columns should be a multiple of those of {source}")
@@ -234,7 +237,7 @@ class StoredImages(IterableDataset):
             order = torch.randperm(len(self.archive), generator=_generator(self.seed, 0, epoch))
             scan = int(order[place_in_epoch])
             pixels = torch.randperm(len(self.located), generator=_generator(self.seed, 1, place))[: self.queries]
-            sparse, dense = (self.archive.scan(scan, size).filled() for size in (self.source, self.target))
+            sparse, dense = (self._upright(self.archive.scan(scan, size)) for size in (self.source, self.target))
             if self.sector is not None:
                 first = int(torch.randint(sparse.shape[1], (), generator=_generator(self.seed, 2, place)))
                 sparse = sparse.roll(-first, 1)[:, : self.sector]
@@ -243,6 +246,9 @@ class StoredImages(IterableDataset):
             queries.append(self.located[pixels])
             ranges.append(dense.reshape(-1)[pixels])
         return Batch(torch.stack(images), torch.stack(queries), torch.stack(ranges), self.wrap, self.sensor)
+
+    def _upright(self, scan: Scan) -> torch.Tensor:
+        return scan.filled().flip(scan.sensor.flips())
 
 
 def _part(batch: int, part: tuple[int, int]) -> slice:

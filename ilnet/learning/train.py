@@ -117,7 +117,7 @@ class Training(lightning.LightningModule):
         model: The model to train, see `Model.loss`.
         held_out: Pairs of an input scan and the scan to be predicted.
         rate: Highest learning rate.
-        halve_after: Steps after which the rate is halved; if empty, it follows one cycle.
+        halve_after: Steps after which the rate is halved; None for one cycle, in which it rises, then falls to 0.
         run: What tells this run from others; kept in its checkpoints.
         probe: More such pairs. Their figures are logged and decide nothing.
     """
@@ -127,7 +127,7 @@ class Training(lightning.LightningModule):
         model: models.Model,
         held_out: Sequence[Pair],
         rate: float,
-        halve_after: Sequence[int] = (),
+        halve_after: Sequence[int] | None = None,
         run: dict[str, Any] | None = None,
         probe: Sequence[Pair] = (),
     ):
@@ -181,7 +181,7 @@ class Training(lightning.LightningModule):
         optimizer = torch.optim.Adam(self.parameters(), lr=self.rate, eps=1e-6)
         steps = int(self.trainer.estimated_stepping_batches)
         schedule: torch.optim.lr_scheduler.LRScheduler
-        if self.halve_after:
+        if self.halve_after is not None:
             schedule = torch.optim.lr_scheduler.MultiStepLR(optimizer, list(self.halve_after), 0.5)
         else:
             schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, self.rate, steps, pct_start=min(0.3, 100 / steps))
@@ -340,7 +340,9 @@ def _build(
     model = plan.make(**plan.arguments)
     samples = _samples(plan, start, part, device)
     held_out = [pair for pairs in held_out_pairs(_validation(plan), device) for pair in pairs]
-    halve_after = [epoch * plan.per_epoch for epoch in plan.size.halve_after]
+    halve_after = [epoch * plan.per_epoch for epoch in plan.size.halve_after] if plan.size.epochs else None
+    if halve_after and plan.name == "lidar-sr":
+        halve_after = []  # the authors' rate stays as it is
     rate = min(plan.size.rate, RATES.get(plan.name, math.inf))
     training = Training(model, held_out, rate, halve_after, plan.run, probe)
     number, processes = part
@@ -495,9 +497,10 @@ def _samples(
         )
     columns = source.shape[1]
     if plan.name == "lidar-sr":
-        # It learns all pixels that it predicts. Batch norm needs several scans, so it sees only a sector of each.
-        scans, sector = size.crops, columns if size.epochs else size.columns // 2
-        queries = math.prod(target) * sector // columns
+        # It learns all pixels that it predicts: of whole scans, as the authors do, or of a sector of each. Batch norm
+        # needs several scans.
+        scans, sector = size.crops, None if size.epochs else size.columns // 2
+        queries = math.prod(target) * (sector or columns) // columns
     else:  # as many columns and as many queries as the crops have, in whole scans
         scans, sector = max(1, size.crops * size.columns // columns), None
         queries = size.crops * size.queries // scans

@@ -73,6 +73,10 @@ class LiDARSR(Model):
         self.merge = nn.ModuleList(_Block(*widths) for widths in pairwise(_WIDTHS[::-1]))
         self.last = nn.Conv2d(_WIDTHS[0], 1, 1)
         self.dropout = nn.Dropout2d(dropout)
+        for layer in self.modules():
+            if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d)):
+                nn.init.kaiming_normal_(layer.weight)
+                nn.init.zeros_(layer.bias)
         # This format saves a sixth of the time on a CPU.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 

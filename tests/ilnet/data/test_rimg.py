@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ilnet.data import open_archive
+from ilnet.data import StoredImages, open_archive
 from ilnet.data.rimg import RangeImageTree
 
 SPECIFICATION = """max_r: 80.0  # metres
@@ -149,3 +149,20 @@ def test_a_copy_read_from_elsewhere_gives_the_same(tree, tmp_path):
     copy = shutil.copytree(tree, tmp_path / "copy")
     first, second = open_archive(tree), open_archive(copy)
     assert all(torch.equal(first.scan(k, "4x32").ranges, second.scan(k, "4x32").ranges) for k in range(len(first)))
+
+
+def test_batches_hold_images_as_networks_see_them(tree):
+    """Azimuths of the authors' images fall; every network is shown rising ones."""
+    scans = open_archive(tree)
+    batch = next(iter(StoredImages(scans, "4x32", "8x32", 1, 256, 0)))
+    sensor = scans.sensors["4x32"].upright()
+    assert batch.sensor == sensor
+    assert sensor.azimuths[0] < sensor.azimuths[-1]
+    found = [k for k in range(3) if torch.equal(scans.scan(k, "4x32").filled().flip(-1), batch.image[0])]
+    assert len(found) == 1
+    dense = scans.scan(found[0], "8x32")
+    row, column = (batch.queries[0] * torch.tensor([7 / 3, 1.0])).round().long().unbind(-1)
+    assert torch.equal(dense.filled().flip(-1)[row, column], batch.ranges[0])
+    # A query names the same direction in the sensor's own order.
+    where = dense.sensor.upright().azimuths[column]
+    assert where == pytest.approx(dense.sensor.azimuths[31 - column])

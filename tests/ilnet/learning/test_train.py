@@ -371,3 +371,23 @@ def test_lidar_sr_learns_the_one_size_that_it_predicts(tmp_path, quick, yard):
     assert (model.rows, model.columns) == (4, 1)
     scan = simulate.scan(yard, sensors["16x1024"], pose((0.0, 0.0, 1.8)))
     assert model.upsample(scan, sensors["64x1024"]).sensor.shape == (64, 1024)
+
+
+@pytest.mark.parametrize(("name", "halved"), [("iln", [2]), ("lidar-sr", [])])
+def test_as_the_authors_train(tmp_path, quick, monkeypatch, name, halved):
+    """The rate is halved after epochs, but that of LiDAR-SR never; images are whole, in their own order of columns."""
+    sensors = {size: preset(f"paper-{size}") for size in ("16x1024", "64x1024")}
+    archive = data.Archive.create(tmp_path / "data", 2, sensors, {"towns": ["nowhere"]})
+    images = {size: np.full((2, *sensor.shape), 5000, np.uint16) for size, sensor in sensors.items()}
+    images["16x1024"][..., 0] = 700
+    archive.write(0, images, np.zeros(2, int), np.zeros(2, int), np.zeros((2, 4, 4)))
+    size = dataclasses.replace(train.PRESETS["tiny"], steps=0, epochs=4, halve_after=(2,), columns=1024)
+    monkeypatch.setitem(train.PRESETS, "tiny", size)
+    monkeypatch.setattr(train, "_run", lambda plan, training, batches, *rest: (plan, training, batches))
+    plan, training, batches = train.train(name, "tiny", tmp_path, archive=tmp_path / "data", target=(64, 1024))
+    assert training.halve_after == halved
+    assert plan.steps == 4
+    image = next(iter(batches)).image
+    assert image.shape == (2, 16, 1024)
+    assert len(image[..., 0].unique()) == 1
+    assert image[..., 0].max() < image[..., 1:].min()

@@ -760,3 +760,12 @@ def test_bad_weights_are_refused(tmp_path):
     models.save(small(), tmp_path / "other.safetensors", "iln", {"blocks": 3})
     with pytest.raises(ValueError, match="not weights"):
         models.load(tmp_path / "other.safetensors")
+
+
+def test_lidar_sr_starts_as_the_authors_does():
+    """Kaiming's normal distribution, of which the deviation of a 3×3 convolution of 64 channels is 0.059; no bias."""
+    model = models.create("lidar-sr", rows=2, columns=1)
+    convolution = model.merge[3][3]
+    assert convolution.weight.shape == (64, 64, 3, 3)
+    assert convolution.weight.std().item() == pytest.approx((2 / 576) ** 0.5, rel=0.03)
+    assert not convolution.bias.any()
