@@ -224,14 +224,16 @@ class Sensor:
         inside = (row >= -0.5) & (row <= rows - 0.5)
         return inside if self.wrap else inside & (column >= -0.5) & (column <= columns - 0.5)
 
-    def upright(self) -> "Sensor":
-        """Returns the same sensor with its lowest beam first and its azimuths rising, as networks see it."""
-        return replace(self, elevations=np.sort(self.elevations), azimuths=np.sort(self.azimuths))
+    def upright(self, falling: bool = False) -> "Sensor":
+        """Returns the same sensor as a network sees it: lowest beam first, azimuths rising or, for some, `falling`."""
+        azimuths = np.sort(self.azimuths)
+        return replace(self, elevations=np.sort(self.elevations), azimuths=azimuths[::-1] if falling else azimuths)
 
-    def flips(self) -> list[int]:
-        """Returns the axes of images (..., H, W), among -2 and -1, that turn around where `upright` turns a table."""
-        tables = {-2: self.elevations, -1: self.azimuths}
-        return [axis for axis, table in tables.items() if table[0] > table[-1]]
+    def flips(self, falling: bool = False) -> list[int]:
+        """Returns the axes of images (..., H, W), -2 or -1 or both, along which `upright` reverses the order."""
+        turned = self.upright(falling)
+        tables = {-2: (self.elevations, turned.elevations), -1: (self.azimuths, turned.azimuths)}
+        return [axis for axis, (table, upright) in tables.items() if table[0] != upright[0]]
 
     def decimation(self, rows: int | None = None, columns: int | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Returns the numbers of the rows and columns that `decimate` keeps.

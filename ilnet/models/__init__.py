@@ -84,7 +84,7 @@ def save(model: Model, path: str | Path, name: str, arguments: dict[str, Any], *
         OSError: If the file cannot be written.
     """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    about = {"name": name, "arguments": {**_MODELS[name][1], **arguments}, **card}
+    about = {"name": name, "arguments": {**_MODELS[name][1], **arguments}, "falling": model.falling, **card}
     state = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
     weights = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
     try:
@@ -118,13 +118,15 @@ def load(name: str | Path) -> Model:
         raise FileNotFoundError(f"{path}: no such file of weights")
     if path.suffix == ".pth":
         kind, arguments, state = authors.read(path)
+        falling = True
     else:
-        kind, arguments, state = _read(path)
+        kind, arguments, state, falling = _read(path)
     try:
         model = create(kind, **arguments)
         _fill(model, state)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: not weights of {kind} with {arguments} ({error})") from error
+    model.falling = falling
     return model.eval()
 
 
@@ -137,11 +139,11 @@ def _fill(model: Model, state: dict[str, torch.Tensor]) -> None:
     model.load_state_dict(state)
 
 
-def _read(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.Tensor]]:
-    """Returns what `save` wrote: name, arguments and parameters."""
+def _read(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.Tensor], bool]:
+    """Returns what `save` wrote: name, arguments, parameters and whether azimuths fall."""
     try:
         with safe_open(path, "pt") as file:
             about = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
-        return about["name"], dict(about["arguments"]), load_file(path)
+        return about["name"], dict(about["arguments"]), load_file(path), bool(about.get("falling"))
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: not weights that `models.save` wrote ({error})") from error

@@ -48,8 +48,8 @@ class Answer(NamedTuple):
 class Model(nn.Module):
     """A function r̂ = f(I, q) of a range image and query directions (paper, Eq. 1).
 
-    The networks were trained with the lowest beam in row 0 and with rising azimuths. `ranges` and `upsample` flip scans
-    that are stored in another order.
+    The networks were trained with the lowest beam in row 0 and with rising azimuths, or with falling ones if they are
+    `falling`. `ranges` and `upsample` flip scans that are stored in another order.
 
     A subclass defines `decode`. It defines `encode` if it extracts features, `answer` if it tells more than ranges,
     `check_sensors` if it cannot predict every sensor, and `loss` if it learns from another one.
@@ -61,6 +61,10 @@ class Model(nn.Module):
 
     tells_confidence = False
     """Whether `answer` tells a confidence."""
+
+    falling = False
+    """Whether the network was trained on images whose azimuths fall, as those of the paper's authors do. `ranges` and
+    `upsample` show it such images."""
 
     backend = "warp"
     """The backend of the ops: "warp", or "torch" for their plain twins (`kernels.reference`)."""
@@ -100,7 +104,7 @@ class Model(nn.Module):
 
         Args:
             image: (B, H, W) float32 ranges in metres, no return filled with the sensor's `norm_range` (`Scan.filled`);
-                lowest beam first, azimuths rising.
+                lowest beam first, azimuths rising or, for a model that is `falling`, falling.
             queries: (B, Q, 2) float32 pixel coordinates (row, column) in that image (`Sensor.locate`).
             wrap: Whether column W-1 meets column 0 (`Sensor.wrap`).
             sensor: The sensor of the image, for models that need its angles.
@@ -219,9 +223,8 @@ class Upsampler:
         self.model, self.source, self.target = model, source, target
         self._half = precision == "bfloat16"
         # Networks were trained on upright images; a sensor may store its beams and columns in either order.
-        tables = {-2: source.elevations, -1: source.azimuths}
-        self._flips = [axis for axis, table in tables.items() if table[0] > table[-1]]
-        self._upright = upright = source.upright()
+        self._flips = source.flips(model.falling)
+        self._upright = upright = source.upright(model.falling)
         queries = upright.grid_queries(target)
         self._seen = upright.contains(queries).to(self.device)
         self._queries = queries.view(1, -1, 2).to(self.device)

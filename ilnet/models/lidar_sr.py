@@ -76,7 +76,7 @@ class LiDARSR(Model):
         for layer in self.modules():
             if isinstance(layer, (nn.Conv2d, nn.ConvTranspose2d)):
                 nn.init.kaiming_normal_(layer.weight)
-                nn.init.zeros_(layer.bias)
+                nn.init.zeros_(layer.get_parameter("bias"))
         # This format saves a sixth of the time on a CPU.
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 

@@ -3,12 +3,15 @@
 import json
 import math
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 
 from ilnet import models
+from ilnet.data.rimg import RangeImageTree
 from ilnet.models import authors
+from ilnet.scan import Scan
 
 # float32 ranges below 100 m through dozens of layers.
 METRES = 1e-3
@@ -308,3 +311,24 @@ def test_other_files_are_refused(tmp_path):
             models.load(path)
     with pytest.raises(FileNotFoundError, match="no such file of weights"):
         models.load(tmp_path / "none.pth")
+
+
+@pytest.mark.parametrize("name", ["iln_1d_random", "liif_random"])
+def test_their_checkpoints_answer_their_scans_as_their_code_does(shared, tmp_path, name):
+    """Through `ranges`, for scans whose azimuths fall as in their files, and for the same scans in our order."""
+    folder = shared / "data/authors"
+    expected = np.load(folder / f"{name.removesuffix('_random')}_expected.npz")
+    sensors = RangeImageTree(folder).sensors
+    source, target = sensors["16x1024"], sensors["64x1024"]
+    image = torch.from_numpy(expected["range_image_m"]).float()
+    image = image.where(image <= source.max_range, 0.0)
+    row, column = torch.from_numpy(expected["pixel"]).long().unbind(-1)
+    away = (column > 40) & (column < 1024 - 40)  # their neighbours clamp at the seam, and convolutions see across it
+    metres = (torch.from_numpy(expected["output_normalised"]).float().flatten() + 1) * 50
+    model = models.load(folder / f"{name}.pth")
+    models.save(model, tmp_path / "ours.safetensors", name.partition("_")[0], {})
+    for loaded in (model, models.load(tmp_path / "ours.safetensors")):
+        theirs = loaded.ranges(Scan(image, source), target)[row, column]
+        torch.testing.assert_close(theirs[away], metres[away], rtol=0, atol=0.01)
+        ours = loaded.ranges(Scan(image.flip(-1), source.upright()), target.upright()).flip(-1)[row, column]
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=METRES)
