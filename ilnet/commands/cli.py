@@ -13,7 +13,7 @@ __all__ = ["main"]
 
 _SIZES = "16x1024,64x1024,128x2048,256x4096"
 # Those of `experiment.EXPERIMENTS`, which takes seconds to import.
-_EXPERIMENTS = "table", "convergence", "attention", "rays", "real", "surfaces", "confidence", "sensors", "all"
+_EXPERIMENTS = "table", "convergence", "attention", "rays", "real", "surfaces", "confidence", "sensors", "fair", "all"
 
 
 class _Size(click.ParamType):

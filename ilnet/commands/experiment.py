@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ilnet import data, models, scan_files
-from ilnet.commands import evidence, plot
+from ilnet.commands import evidence, fair, plot
 from ilnet.commands.study import COLOURS, SERIES, Study, grouped_bars, loaded, made_with
 from ilnet.learning import evaluate
 from ilnet.sensor import PAPER_INPUT, format_size
@@ -238,6 +238,7 @@ EXPERIMENTS: dict[str, Callable[[Study], None]] = {
     "surfaces": evidence.surfaces,
     "confidence": evidence.confidence,
     "sensors": evidence.sensors,
+    "fair": fair.fair,
 }
 
 
@@ -311,6 +312,8 @@ def _shown(name: str, rows: Sequence[dict[str, Any]]) -> Sequence[dict[str, Any]
         return [row for row in rows if int(row["step"]) == last]
     if name == "surfaces":
         return evidence.spans(rows)
+    if name == "fair":
+        return fair.spread(rows)
     return _beside_the_paper(rows) if name == "table" else rows
 
 

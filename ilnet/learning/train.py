@@ -51,7 +51,7 @@ HELD_OUT_SENSORS = "hdl-64e", "os0-128", "os1-64"
 # likelihood is steep where a network is sure, and at a rate of 1e-3 long runs collapse.
 RATES = {"iln-surfaces": 4e-4}
 LARGEST_GRADIENT = {"iln-surfaces": 10.0}
-PRECISION: Any = "bf16-mixed"
+PRECISION = "bf16-mixed"
 # How many validations a training has, and the fewest and the most steps between them.
 VALIDATIONS = 20
 VALIDATE_EVERY = 50, 2000
@@ -200,6 +200,7 @@ def train(
     probe: Sequence[Pair] = (),
     make: Callable[..., models.Model] | None = None,
     validations: int = VALIDATIONS,
+    precision: str = PRECISION,
     **arguments: Any,
 ) -> dict[str, float]:
     """Trains a model and writes its weights and figures; an interrupted run in `out` goes on where it stopped.
@@ -223,6 +224,7 @@ def train(
         make: What makes the untrained model from its arguments, by default `models.create`. Its weights should be those
             of a model called `name`, as which they are written; its loss may be another one.
         validations: How often held-out scans are measured. The weights that were best there are written.
+        precision: Lightning's name of the precision of a step: "bf16-mixed", or "32-true" for float32.
         **arguments: Arguments of the model; they override the preset's.
 
     Returns:
@@ -233,7 +235,7 @@ def train(
             an interrupted run of another kind, there are `sensors` as well as an `archive`, a process has no GPU of its
             own, or a loss is not finite.
     """
-    plan = _plan(name, preset_name, steps, seed, archive, target, sensors, make, validations, arguments)
+    plan = _plan(name, preset_name, steps, seed, archive, target, sensors, make, validations, precision, arguments)
     start = _steps_done(out / name / "last.ckpt", plan.run)
     training, batches, scans = _build(plan, start, probe)
     return _run(plan, training, batches, scans, out, start)
@@ -273,6 +275,7 @@ class _Plan:
     """Arguments of the model."""
     steps: int
     validations: int
+    precision: str
     seed: int
     stored: data.Archive | data.RangeImageTree | None
     """Stored images to learn from; None for continuous rays."""
@@ -295,6 +298,7 @@ def _plan(
     sensors: Sequence[Sensor] | None,
     make: Callable[..., models.Model] | None,
     validations: int,
+    precision: str,
     arguments: dict[str, Any],
 ) -> _Plan:
     """Checks the arguments of `train` and completes them from the preset."""
@@ -326,9 +330,12 @@ def _plan(
         names = [sensor.name or sensor.size for sensor in sensors] or ["any"]
         learns_from = {"data": "continuous rays", "sensors": names}
     variant = {"variant": make.__name__} if make else {}
-    run = {"preset": preset_name, "steps": steps, "seed": seed, **learns_from, **variant, **arguments}
+    rounded = {"precision": precision} if precision != PRECISION else {}
+    run = {"preset": preset_name, "steps": steps, "seed": seed, **rounded, **learns_from, **variant, **arguments}
     make = make or partial(models.create, name)
-    return _Plan(name, make, size, arguments, steps, validations, seed, stored, per_epoch, target, sensors, run)
+    return _Plan(
+        name, make, size, arguments, steps, validations, precision, seed, stored, per_epoch, target, sensors, run
+    )
 
 
 def _build(
@@ -365,7 +372,7 @@ def _run(
     last = folder / "last.ckpt"
     trainer = lightning.Trainer(
         max_steps=steps,
-        precision=PRECISION,
+        precision=plan.precision,  # type: ignore[arg-type]
         accelerator=simulate.best_device().type,
         **_processes(int(os.environ.get("WORLD_SIZE", 1))),
         use_distributed_sampler=False,

@@ -132,10 +132,17 @@ class ILN(Model):
 
     def decode(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Blends the ranges of the 4 neighbours of each query, with predicted weights."""
+        prior, floor = self.prior, self.area_floor
+        if encoded.projected is not None and self.is_fused(encoded):  # scores and blend as one kernel
+            weights = self._decoder_weights()
+            return fused_decode(encoded.projected, image, queries, weights, prior, wrap, area_floor=floor)
+        scores = self.scores(encoded, queries, wrap).to(image.dtype)
+        return gather_blend(image, queries, scores, prior, wrap, area_floor=floor, backend=self.backend)
+
+    def scores(self, encoded: _Encoded, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+        """Returns the score (B, Q, 4) of each neighbour of queries (B, Q, 2); see `kernels.gather_blend`."""
         features, projected = encoded
-        blocks, prior, floor = self.blocks, self.prior, self.area_floor
-        if projected is not None and self.is_fused(encoded):  # all that follows as one kernel
-            return fused_decode(projected, image, queries, self._decoder_weights(), prior, wrap, area_floor=floor)
+        blocks = self.blocks
         if projected is None:  # tokens z (B, Q, 4, C): the feature of each neighbour and its embedded offset (Fig. 2)
             z, offsets = gather_neighbours(features, queries, wrap, self.backend)
             z = z + self.position(offsets * OFFSET_SCALE)
@@ -146,8 +153,7 @@ class ILN(Model):
             z = z + first.feed_forward(z)
         for block in blocks:
             z = block(z, self.backend)
-        scores = self.head(z).squeeze(-1).to(image.dtype)
-        return gather_blend(image, queries, scores, prior, wrap, area_floor=floor, backend=self.backend)
+        return self.head(z).squeeze(-1)
 
     def is_fused(self, encoded: _Encoded) -> bool:
         """Returns whether the whole decoder is one kernel: in inference, at depth 1, if `fused_decode` can run."""

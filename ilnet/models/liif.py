@@ -40,9 +40,13 @@ class LIIF(Model):
 
     def decode(self, features: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Predicts and blends the values of the 4 neighbours of each query."""
+        values = self.values(features, queries, wrap)
+        return (area_blend(values, queries, self.backend) + 1) * (self.norm_range / 2)
+
+    def values(self, features: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+        """Returns the value (B, Q, 4) of each neighbour of queries (B, Q, 2): a range scaled to [-1, 1]."""
         z, offsets = gather_neighbours(features, queries, wrap, self.backend)
         hidden = self.value[:-1](torch.cat((z, (offsets * OFFSET_SCALE).to(z.dtype)), -1))
         # The last layer always runs in float32: near 1, the spacing of bfloat16 is 0.004, which is 20 cm.
         with torch.autocast(z.device.type, enabled=False):
-            values = self.value[-1](hidden.float()).squeeze(-1)
-        return (area_blend(values, queries, self.backend) + 1) * (self.norm_range / 2)
+            return self.value[-1](hidden.float()).squeeze(-1)

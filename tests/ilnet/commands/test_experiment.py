@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ilnet import data, models
-from ilnet.commands import cli, evidence, experiment, variants
+from ilnet.commands import cli, evidence, experiment, fair, variants
 from ilnet.commands.study import Study
 from ilnet.learning import evaluate, metrics, train
 from ilnet.sensor import PAPER_INPUT, preset
@@ -270,3 +270,19 @@ def test_the_page_that_ships_is_the_one_that_its_numbers_make(tmp_path):
         shutil.copy(file, tmp_path)
     page = experiment.results(Study(None, tmp_path))
     assert page.read_text() == (shipped / "RESULTS.md").read_text()
+
+
+def test_values_corrections_and_weights_are_compared_with_all_else_equal(study, monkeypatch):
+    monkeypatch.setattr(fair, "REHEARSAL", 2)
+    monkeypatch.setattr(fair, "_TRAINING", {**fair._TRAINING, "steps": 2})
+    small = {"features": 16, "blocks": 1}
+    monkeypatch.setattr(fair, "_SIZE", {"MLP": {**small, "hidden": 16}, "attention": small})
+    alone = Study(study.preset, study.out, scans=1, seeds=1)
+    fair.fair(alone)
+    found = rows(alone, "fair")
+    cases = {(row["kind"], row["decoder"], row["start"]) for row in found}
+    assert len(cases) == 3 * 2 * 2
+    assert len(found) == len(cases) * len(study.sizes)
+    assert len({row["mae"] for row in found if row["size"] == "16x256"}) > 6
+    assert (study.out / "fair.png").read_bytes()[:4] == b"\x89PNG"
+    assert "## fair" in experiment.results(alone).read_text()

@@ -1,0 +1,192 @@
+"""What the experiment `fair` compares: values, corrections and weights, with all else equal.
+
+Of each neighbour t of a query the decoder predicts one number h_t. The three kinds differ in nothing but what it means:
+
+    values        r̂ = Σ_t a_t v(h_t)              the paper's Eq. (2); a_t are the bilinear areas
+    corrections   r̂ = Σ_t a_t (r_t + Δ(h_t))      values, anchored to the measured ranges r_t
+    weights       r̂ = Σ_t softmax(h)_t r_t        the paper's Eq. (3)
+
+Here v(h) = (h + 1) R / 2 and Δ(h) = h R / 2, with R = `norm_range`. Each kind has LIIF's decoder, a multilayer
+perceptron (MLP) that sees one neighbour at a time, or ILN's, attention among the four. Each starts as in the paper or
+from bilinear interpolation: the last layer of corrections starts at zero, and so does that of weights, to whose h_t
+log a_t is added. Values first learn the answers of bilinear interpolation, for `REHEARSAL` steps that are not counted.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import nn
+
+from ilnet import models
+from ilnet.commands.study import SERIES, Study
+from ilnet.models import ILN, LIIF
+from kernels import area_blend, gather_blend, gather_neighbours
+
+__all__ = ["DECODERS", "KINDS", "REHEARSAL", "STARTS", "fair", "rehearsing", "spread", "variant"]
+
+KINDS = ("values", "corrections", "weights")
+DECODERS = {"MLP": "liif", "attention": "iln"}
+"""The decoders, and the models that have them."""
+STARTS = ("as the paper", "from bilinear")
+REHEARSAL = 200
+"""Steps in which values learn bilinear interpolation before they start from it."""
+
+# One network apart from what is compared. LIIF's hidden layers are narrower than the paper's, so that a step of either
+# decoder takes about as long.
+_SIZE = {"MLP": {"features": 32, "blocks": 8, "hidden": 128}, "attention": {"features": 32, "blocks": 8}}
+_TRAINING = {"steps": 1000, "validations": 2, "precision": "32-true"}
+_FIGURES = {"iou": "IoU", "mae": "MAE [m]", "floating": "floating"}
+
+
+def _answer(
+    kind: str, h: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool, prior: str, model: Any
+) -> torch.Tensor:
+    """Returns ranges (B, Q) [m], given the number (B, Q, 4) that was predicted for each neighbour."""
+    if kind == "weights":
+        return gather_blend(image, queries, h, prior, wrap, area_floor=1e-4, backend=model.backend)
+    half = model.norm_range / 2
+    if kind == "values":
+        return area_blend((h + 1) * half, queries, model.backend)
+    measured, _ = gather_neighbours(image.unsqueeze(1), queries, wrap, model.backend)
+    return area_blend(measured.squeeze(-1) + h * half, queries, model.backend)
+
+
+class _Compared:
+    """A network of which only the meaning of the predicted numbers is changed; see `variant`."""
+
+    kind: str
+    prior: str
+    rehearses: bool
+
+    def decode(self, encoded: Any, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+        predict = self.values if isinstance(self, LIIF) else self.scores  # type: ignore[attr-defined]
+        h = predict(encoded, queries, wrap).float()
+        return _answer(self.kind, h, image, queries, wrap, self.prior, self)
+
+    def is_fused(self, encoded: Any) -> bool:
+        return False
+
+    def loss(self, image: torch.Tensor, queries: torch.Tensor, ranges: torch.Tensor, *rest: Any) -> torch.Tensor:
+        if self.rehearses:
+            ranges = models.create("bilinear")(image, queries, rest[0])
+        return super().loss(image, queries, ranges, *rest)  # type: ignore[misc]
+
+
+def variant(kind: str, decoder: str, start: str, rehearsed: Path | None = None) -> Callable[..., models.Model]:
+    """Returns what makes an untrained network, for `train.train`.
+
+    Args:
+        kind: One of `KINDS`.
+        decoder: One of `DECODERS`.
+        start: One of `STARTS`.
+        rehearsed: The weights that values start from, where they start from bilinear interpolation.
+    """
+    parent: type[models.Model] = {"liif": LIIF, "iln": ILN}[DECODERS[decoder]]
+    bilinear = start == STARTS[1]
+    prior = "bilinear" if bilinear and kind == "weights" else "none"
+    names = {"kind": kind, "prior": prior, "rehearses": False}
+    made = type(f"{kind} by {decoder}, {start}", (_Compared, parent), names)
+
+    def make(**arguments: Any) -> models.Model:
+        model = made(**arguments)
+        model.kind, model.prior = kind, prior  # ILN has a prior of its own
+        if rehearsed is not None:
+            model.load_state_dict(models.load(rehearsed).state_dict())
+        elif bilinear:
+            last = (model.value if decoder == "MLP" else model.head)[-1]
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+        return model
+
+    make.__name__ = made.__name__
+    return make
+
+
+def rehearsing(decoder: str) -> Callable[..., models.Model]:
+    """Returns what makes a network of values that learns the answers of bilinear interpolation."""
+    plain = variant("values", decoder, STARTS[0])
+
+    def make(**arguments: Any) -> models.Model:
+        model = plain(**arguments)
+        model.rehearses = True  # type: ignore[assignment]
+        return model
+
+    make.__name__ = f"bilinear by {decoder}"
+    return make
+
+
+def fair(study: Study) -> None:
+    """The paper's claim, one thing at a time: values, corrections and weights, with all else equal.
+
+    Each is trained with either decoder and from either start, for 1000 steps in float32 on the same rays.
+    """
+    rows = []
+    for seed, kind, decoder, start in product(range(study.seeds), KINDS, DECODERS, STARTS):
+        case = {"kind": kind, "decoder": decoder, "start": start, "seed": seed}
+        model = _trained(study, kind, decoder, start, seed)
+        for row in study.compare({kind: model}):
+            rows.append(case | {key: row[key] for key in ("size", "scans", *_FIGURES)})
+    study.write("fair", rows)
+    _draw(study, rows)
+
+
+def _trained(study: Study, kind: str, decoder: str, start: str, seed: int) -> models.Model:
+    name, size = DECODERS[decoder], _SIZE[decoder]
+    rehearsed = None
+    if kind == "values" and start == STARTS[1]:
+        options = {**_TRAINING, "steps": REHEARSAL, "validations": 1}
+        label = f"fair-rehearsal-{decoder}-{seed}"
+        rehearsed = study.trained(label, name, seed=seed, make=rehearsing(decoder), **options, **size)
+    make = variant(kind, decoder, start, rehearsed)
+    label = f"fair-{kind}-{decoder}-{start.replace(' ', '-')}-{seed}"
+    file = study.trained(label, name, seed=seed, make=make, **_TRAINING, **size)
+    model = make(**size)
+    model.load_state_dict(models.load(file).state_dict())
+    return model.eval()
+
+
+def _by_case(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str, str, str], dict[str, list[float]]]:
+    """Returns the figures of all seeds, by kind, decoder, start and size."""
+    found: dict[tuple[str, str, str, str], dict[str, list[float]]] = {}
+    for row in rows:
+        case = row["kind"], row["decoder"], row["start"], row["size"]
+        figures = found.setdefault(case, {key: [] for key in _FIGURES})
+        for key, values in figures.items():
+            values.append(float(row[key]))
+    return found
+
+
+def spread(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Returns for each case the means over the seeds and their spans, given the rows of `fair`."""
+    table = []
+    for (kind, decoder, start, size), figures in _by_case(rows).items():
+        line: dict[str, Any] = {"kind": kind, "decoder": decoder, "start": start, "size": size}
+        for key, values in figures.items():
+            line[key] = f"{np.mean(values):.3f} ({min(values):.3f} to {max(values):.3f})"
+        table.append(line)
+    return table
+
+
+def _draw(study: Study, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Draws the IoU of each case at each size: means over the seeds, and their spans."""
+    found = _by_case(rows)
+    sizes = list(dict.fromkeys(size for *_, size in found))
+    figure = Figure(figsize=(10, 3.2), layout="constrained")
+    cases = list(product(DECODERS, STARTS))
+    for axis, size in zip(np.atleast_1d(figure.subplots(1, len(sizes), sharey=True)), sizes, strict=True):
+        for number, kind in enumerate(KINDS):
+            for at, (decoder, start) in enumerate(cases):
+                values = found[kind, decoder, start, size]["iou"]
+                where, label = at + 0.2 * (number - 1), kind if at == 0 else None
+                axis.plot([where, where], [min(values), max(values)], color=SERIES[number])
+                axis.plot(where, np.mean(values), "o", color=SERIES[number], label=label)
+        axis.set_xticks(range(len(cases)), [f"{decoder},\n{start}" for decoder, start in cases], fontsize=7)
+        axis.set_title(size)
+    figure.axes[0].set_ylabel("IoU")
+    figure.axes[0].legend(fontsize=8)
+    figure.savefig(study.out / "fair.png", dpi=120)
