@@ -13,7 +13,19 @@ __all__ = ["main"]
 
 _SIZES = "16x1024,64x1024,128x2048,256x4096"
 # Those of `experiment.EXPERIMENTS`, which takes seconds to import.
-_EXPERIMENTS = "table", "convergence", "attention", "rays", "real", "surfaces", "confidence", "sensors", "fair", "all"
+_EXPERIMENTS = (
+    "table",
+    "convergence",
+    "attention",
+    "rays",
+    "real",
+    "surfaces",
+    "confidence",
+    "sensors",
+    "fair",
+    "alignment",
+    "all",
+)
 
 
 class _Size(click.ParamType):
@@ -474,7 +486,13 @@ def towns(names: tuple[str, ...], out: Path) -> None:
 @click.option(
     "--data", type=Path, metavar="DIR", help="Stored images: for LiDAR-SR, and to compare with continuous rays."
 )
-@click.option("--measured", type=Path, multiple=True, metavar="FILE", help="A measured scan; may be repeated.")
+@click.option(
+    "--measured",
+    type=Path,
+    multiple=True,
+    metavar="FILE|FOLDER",
+    help="A measured scan, or all those in a folder; may be repeated.",
+)
 def experiment(
     names: tuple[str, ...],
     preset: str | None,
@@ -487,14 +505,17 @@ def experiment(
     """Run the paper's experiments and ours: CSV, figures, RESULTS.md. An interrupted run goes on where it stopped."""
     if not names:
         raise click.UsageError("name some experiments, or all")
+    from ilnet import scan_files
     from ilnet.commands import experiment
     from ilnet.commands.study import Study
 
     chosen = tuple(experiment.EXPERIMENTS) if "all" in names else names
-    for name, option, value in (("rays", "--data DIR", data), ("real", "--measured FILE", measured)):
+    needs = {"rays": ("--data DIR", data)} | dict.fromkeys(("real", "alignment"), ("--measured FILE", measured))
+    for name, (option, value) in needs.items():
         if name in chosen and not value:  # said before hours of training, not after
             raise click.UsageError(f"{name} needs {option}")
-    study = Study(preset, out, scans, seeds, data, measured)
+    files = tuple(path for named in measured for path in scan_files.listed(named))
+    study = Study(preset, out, scans, seeds, data, files)
     for name in chosen:
         experiment.EXPERIMENTS[name](study)
         click.echo(experiment.results(study))

@@ -239,6 +239,7 @@ EXPERIMENTS: dict[str, Callable[[Study], None]] = {
     "confidence": evidence.confidence,
     "sensors": evidence.sensors,
     "fair": fair.fair,
+    "alignment": fair.alignment,
 }
 
 

@@ -1,4 +1,4 @@
-"""What the experiment `fair` compares: values, corrections and weights, with all else equal.
+"""Fair comparisons: values, corrections and weights with all else equal; queries at right and at wrong angles.
 
 Of each neighbour t of a query the decoder predicts one number h_t. The three kinds differ in nothing but what it means:
 
@@ -13,6 +13,7 @@ log a_t is added. Values first learn the answers of bilinear interpolation, for 
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,15 @@ import torch
 from matplotlib.figure import Figure
 from torch import nn
 
-from ilnet import models
-from ilnet.commands.study import SERIES, Study
+from ilnet import models, scan_files
+from ilnet.commands.study import SERIES, Study, grouped_bars, loaded
+from ilnet.learning import evaluate
 from ilnet.models import ILN, LIIF
+from ilnet.scan import Scan
+from ilnet.world import simulate
 from kernels import area_blend, gather_blend, gather_neighbours
 
-__all__ = ["DECODERS", "KINDS", "REHEARSAL", "STARTS", "fair", "rehearsing", "spread", "variant"]
+__all__ = ["DECODERS", "KINDS", "REHEARSAL", "STARTS", "alignment", "fair", "rehearsing", "spread", "variant"]
 
 KINDS = ("values", "corrections", "weights")
 DECODERS = {"MLP": "liif", "attention": "iln"}
@@ -148,6 +152,33 @@ def _trained(study: Study, kind: str, decoder: str, start: str, seed: int) -> mo
     model = make(**size)
     model.load_state_dict(models.load(file).state_dict())
     return model.eval()
+
+
+def alignment(study: Study) -> None:
+    """The same networks, asked at the right angles and at the wrong ones: what a slip in published code costs.
+
+    Rows 0, 4, 8, … of a measured scan are kept, and all are predicted. *right* gives each row its own elevation.
+    *wrong* spreads the rows that are kept evenly over the whole field of view, of which they lack the last rows.
+    """
+    if not study.measured:
+        raise ValueError("no measured scans are named: give some with --measured FILE, such as frames of your sensor")
+    networks = study.networks()
+    compared = loaded({"planes": "planes"} | {name: networks[name] for name in ("iln", "iln-surfaces")})
+    rows = []
+    for path in study.measured:
+        truth = scan_files.read(path).to(simulate.best_device())
+        sensor, ranges = truth.sensor, truth.ranges[::4]
+        tables = {
+            "right": sensor.elevations[::4],
+            "wrong": np.linspace(sensor.elevations[0], sensor.elevations[-1], len(ranges)),
+        }
+        for queries, elevations in tables.items():
+            scan = Scan(ranges, replace(sensor, elevations=elevations, name=""))
+            for row in evaluate.measure(compared, [(scan, truth)]):
+                rows.append({"scan": path.stem, "queries": queries, **row})
+    study.write("alignment", rows)
+    labelled = [row | {"model": f"{row['model']}, {row['queries']}"} for row in rows]
+    grouped_bars(study, "alignment", labelled, [f"{row['scan']}\nfrom every fourth row" for row in rows])
 
 
 def _by_case(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str, str, str], dict[str, list[float]]]:

@@ -21,7 +21,7 @@ from ilnet.world import simulate, towns
 __all__ = ["COLOURS", "SERIES", "Study", "grouped_bars", "loaded", "made_with"]
 
 # Experiments that compare the networks that ship, unless a preset is given to train others.
-_SHIPPED = "table", "real", "confidence", "sensors"
+_SHIPPED = "table", "real", "confidence", "sensors", "alignment"
 
 # Distinguishable for the colour-blind, and in print.
 SERIES = "#0072b2", "#e69f00", "#009e73", "#cc79a7"
@@ -148,7 +148,7 @@ def grouped_bars(study: Study, name: str, rows: Sequence[dict[str, Any]], cases:
     Args:
         study: Says where to.
         name: Of the experiment.
-        rows: One for each case and model.
+        rows: One for each case and model. Models that differ after a comma share a colour; all but "right" are hatched.
         cases: The case of each row, as it is written below its bars.
     """
     kinds, names = list(dict.fromkeys(cases)), list(dict.fromkeys(row["model"] for row in rows))
@@ -158,7 +158,18 @@ def grouped_bars(study: Study, name: str, rows: Sequence[dict[str, Any]], cases:
     for number, model in enumerate(names):
         values = [row["iou"] for row in rows if row["model"] == model]
         at = np.arange(len(kinds)) + width * (number - (len(names) - 1) / 2)
-        axis.bar(at, values, width, label=model, color=COLOURS.get(model, "#555555"))
+        kind, comma, _ = model.partition(",")
+        wrong = comma and not model.endswith("right")
+        axis.bar(
+            at,
+            values,
+            width,
+            label=model,
+            color=COLOURS.get(kind, "#555555"),
+            hatch="////" if wrong else None,
+            edgecolor="white",
+            linewidth=0,
+        )
     axis.set_xticks(range(len(kinds)), kinds, fontsize=6 if len(kinds) > 6 else 8)
     axis.set_ylabel("IoU")
     axis.legend(fontsize=8)

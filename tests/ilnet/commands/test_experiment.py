@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from ilnet import data, models
+from ilnet import data, models, scan_files
 from ilnet.commands import cli, evidence, experiment, fair, variants
 from ilnet.commands.study import Study
 from ilnet.learning import evaluate, metrics, train
@@ -237,6 +237,9 @@ def test_what_is_missing_is_named(study):
 
 def test_two_measured_files_of_one_name_are_refused_before_any_training(tmp_path, command):
     files = [tmp_path / folder / "frame.npz" for folder in ("a", "b")]
+    for file in files:
+        file.parent.mkdir()
+        file.touch()
     with pytest.raises(ValueError, match=r"measured holds .*a/frame.npz and .*b/frame.npz; their names should differ"):
         Study(None, tmp_path, measured=tuple(files))
     code, out, [error] = command("experiment", "convergence", "real", "--measured", files[0], "--measured", files[1])
@@ -286,3 +289,15 @@ def test_values_corrections_and_weights_are_compared_with_all_else_equal(study, 
     assert len({row["mae"] for row in found if row["size"] == "16x256"}) > 6
     assert (study.out / "fair.png").read_bytes()[:4] == b"\x89PNG"
     assert "## fair" in experiment.results(alone).read_text()
+
+
+def test_wrong_angles_cost_every_model(study, tmp_path, yard, monkeypatch):
+    sensor = preset("os1-64").resize(32, 256)
+    scan = simulate.scan(yard, sensor, pose((3.0, 0.0, 1.8)))
+    scan_files.write(tmp_path / "frame.npz", scan)
+    measured = Study(None, study.out, measured=(tmp_path / "frame.npz",))
+    fair.alignment(measured)
+    found = {(row["model"], row["queries"]): float(row["iou"]) for row in rows(measured, "alignment")}
+    assert {model for model, _ in found} == {"planes", "iln", "iln-surfaces"}
+    assert all(found[model, "right"] > 1.5 * found[model, "wrong"] for model, _ in found)
+    assert (study.out / "alignment.png").read_bytes()[:4] == b"\x89PNG"
