@@ -95,13 +95,12 @@ class Scan:
         return directions[measured] * self.ranges[measured, None]
 
     def filled(self, norm_range: float = 0.0) -> torch.Tensor:
-        """Returns what a network sees, (H, W) [m]: no return and ranges beyond `max_range` become `norm_range`.
+        """Returns what a network sees, (H, W) [m]: no return and ranges out of limits become `norm_range`.
 
         Args:
             norm_range: The range that the network was trained with [m]; the sensor's is taken where it is larger.
         """
-        unseen = (self.ranges == 0) | (self.ranges > self.sensor.max_range)
-        return self.ranges.masked_fill(unseen, max(norm_range, self.sensor.norm_range))
+        return self.ranges.where(self.sensor.sees(self.ranges), max(norm_range, self.sensor.norm_range))
 
     def decimate(self, rows: int | None = None, columns: int | None = None) -> "Scan":
         """Returns the scan of only some beams and columns; see `Sensor.decimation`."""

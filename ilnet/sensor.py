@@ -51,7 +51,8 @@ class Sensor:
         azimuths: (W,) [rad], strictly rising or strictly falling once unwrapped, less than a full turn from first to
             last, W >= 2. Spacing may be uneven. The table is stored unwrapped.
         min_range: Nearest range that the sensor measures [m].
-        max_range: Farthest range that the sensor measures [m].
+        max_range: Farthest range that the sensor measures [m]. A range outside these limits counts as no return, for
+            networks and in figures alike; see `sees`.
         norm_range: Range that stands for no return when a network sees a scan [m]. It lies beyond `max_range`, so that
             no return differs from every return: 0 <= min < max < norm.
         name: Used in messages and files.
@@ -223,6 +224,10 @@ class Sensor:
         row, column = queries.unbind(-1)
         inside = (row >= -0.5) & (row <= rows - 0.5)
         return inside if self.wrap else inside & (column >= -0.5) & (column <= columns - 0.5)
+
+    def sees(self, ranges: torch.Tensor) -> torch.Tensor:
+        """Returns which ranges [m] are returns: those above 0 and within the limits, as a bool tensor of that shape."""
+        return (ranges > 0) & (ranges >= self.min_range) & (ranges <= self.max_range)
 
     def upright(self, falling: bool = False) -> "Sensor":
         """Returns the same sensor as a network sees it: lowest beam first, azimuths rising or, for some, `falling`."""

@@ -143,7 +143,7 @@ def ground_height(scan: Scan) -> float | None:
 
 def _seen(scan: Scan) -> torch.Tensor:
     ranges = scan.ranges.cpu()
-    return (ranges > 0) & (ranges >= scan.sensor.min_range) & (ranges <= scan.sensor.max_range)
+    return scan.sensor.sees(ranges)
 
 
 def _shares(values: torch.Tensor, borders: Sequence[int]) -> list[float]:

@@ -90,7 +90,7 @@ def scan_pair(path: Path, rows: int, sensor: str | None = None) -> Pair:
     if rows == truth.sensor.shape[0]:
         raise ValueError(f"rows is {rows}, all the beams of {path}; keep fewer, so that there are some to predict")
     limits = truth.sensor
-    if not ((truth.ranges >= limits.min_range) & (truth.ranges <= limits.max_range)).any():
+    if not limits.sees(truth.ranges).any():
         raise ValueError(
             f"{path}: no return lies within {limits.min_range:g} to {limits.max_range:g} m, "
             f"the nearest at {truth.ranges[truth.ranges > 0].min():g}: are these metres?"

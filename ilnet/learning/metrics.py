@@ -56,13 +56,9 @@ def chamfer(one: torch.Tensor, other: torch.Tensor) -> float:
     return float(there.mean() + back.mean())
 
 
-def _returns(ranges: torch.Tensor, sensor: Sensor) -> torch.Tensor:
-    return (ranges >= sensor.min_range) & (ranges <= sensor.max_range)
-
-
 def cloud(ranges: torch.Tensor, sensor: Sensor) -> torch.Tensor:
     """Returns the points (N, 3) [m] of those ranges (H, W) [m] that lie within the limits of the sensor."""
-    within = _returns(ranges, sensor)
+    within = sensor.sees(ranges)
     return sensor.directions().to(ranges.device)[within] * ranges[within].unsqueeze(-1)
 
 
@@ -138,7 +134,7 @@ def floating(ranges: torch.Tensor, truth: Scan) -> torch.Tensor:
     """
     filled = _padded(truth.filled().unsqueeze(0), truth.sensor.wrap)[0]
     nearest, farthest = (_over_windows(reduce, filled, truth) for reduce in (torch.amin, torch.amax))
-    found = _returns(ranges, truth.sensor) & (ranges > nearest) & (ranges < farthest)
+    found = truth.sensor.sees(ranges) & (ranges > nearest) & (ranges < farthest)
     surfaces = [(filled, filled)]
     for low, high, parted in _pairs(truth):
         surfaces.append((low.masked_fill(parted, torch.inf), high.masked_fill(parted, 0.0)))
@@ -157,7 +153,8 @@ def compare(ranges: torch.Tensor, truth: Scan) -> dict[str, float]:
     """Measures predicted ranges against a scan.
 
     Args:
-        ranges: (H, W) predicted ranges [m]; they are clipped to [0, norm_range], and near `norm_range` means no return.
+        ranges: (H, W) predicted ranges [m]; near `norm_range` and beyond means no return, and so does less than the
+            sensor's minimum.
         truth: The true scan, by the sensor of the prediction.
 
     Returns:
@@ -176,7 +173,8 @@ def compare(ranges: torch.Tensor, truth: Scan) -> dict[str, float]:
         raise ValueError(f"ranges has shape {tuple(ranges.shape)}; it should be {tuple(truth.ranges.shape)}")
     if not ranges.isfinite().all():
         raise ValueError(f"ranges holds {int((~ranges.isfinite()).sum())} NaN or infinite values; all should be finite")
-    ranges = ranges.clamp(0, truth.sensor.norm_range)
+    far = truth.sensor.norm_range
+    ranges = ranges.where(ranges >= truth.sensor.min_range, far).clamp(max=far)
     error, at_edge = (ranges - truth.filled()).abs(), edges(truth)
     predicted, true = (voxels(cloud(image, truth.sensor)) for image in (ranges, truth.filled()))
     common = int(torch.isin(predicted, true, assume_unique=True).sum())
@@ -188,7 +186,7 @@ def compare(ranges: torch.Tensor, truth: Scan) -> dict[str, float]:
         "precision": precision,
         "recall": recall,
         "f1": 2 * precision * recall / max(precision + recall, 1e-12),
-        "floating": _mean(floating(ranges, truth)[_returns(ranges, truth.sensor)].float()),
+        "floating": _mean(floating(ranges, truth)[truth.sensor.sees(ranges)].float()),
         "edge_mae": _mean(error[at_edge]),
         "flat_mae": _mean(error[~at_edge]),
     }

@@ -184,8 +184,7 @@ def spoil(
     lost_grazing = effects.dropout_incidence * (1 - cosines) ** 2
     seen = (ranges > 0) & (luck >= 1 - (1 - effects.dropout) * (1 - lost_far) * (1 - lost_grazing))
     ranges = ranges + noise * (effects.range_noise + effects.range_noise_growth * ranges)
-    seen &= (ranges >= sensor.min_range) & (ranges > 0) & (ranges <= sensor.max_range)
-    return ranges.where(seen, 0.0)
+    return ranges.where(seen & sensor.sees(ranges), 0.0)
 
 
 def _beams(

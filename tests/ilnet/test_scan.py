@@ -26,7 +26,7 @@ def test_filled():
     ranges = torch.full((4, 4), 20.0)
     ranges[0] = torch.tensor([0, 50.5, 50, 0.5])
     filled = Scan(ranges, SENSOR).filled()
-    assert filled[0].tolist() == [60, 60, 50, 0.5]  # no return, beyond max_range, at it, below min_range
+    assert filled[0].tolist() == [60, 60, 50, 60]  # no return, beyond max_range, at it, below min_range
     assert (filled[1:] == 20).all()
     assert ranges[0, 0] == 0  # the scan itself is left alone
 

@@ -59,8 +59,8 @@ def test_out_of_limits_counts_for_the_error_and_not_for_voxels():
     truth = scan(10.05, 1.0, 0.0, 0.0)
     figures = compare(torch.tensor([[10.05, 1.5], [90.0, 300.0]]), truth)
     assert figures["iou"] == 1
-    # 300 m is clipped to 100 m, which is what no return counts as.
-    assert figures["mae"] == pytest.approx((0 + 0.5 + 10 + 0) / 4, abs=1e-5)
+    # 300 m is clipped to 100 m, which is what no return counts as. 1 m and 1.5 m are nearer than the sensor measures.
+    assert figures["mae"] == pytest.approx((0 + 0 + 10 + 0) / 4, abs=1e-5)
 
 
 def test_nothing_predicted_and_nothing_there():
