@@ -5,11 +5,18 @@ from kernels.attention import attend_neighbours
 from kernels.gather import gather_neighbours
 from kernels.gather_blend import gather_blend
 from kernels.neighbour_attention import neighbour_attention
-from kernels.neighbour_attention.decoder import DecoderWeights, fused_decode, fused_decode_serves
+from kernels.neighbour_attention.block import DecoderWeights
+from kernels.neighbour_attention.decoder import fused_decode, fused_decode_serves
 from kernels.neighbour_attention.table import Projected, project_pixels
 from kernels.planes import interpolate_planes
 from kernels.rays.mesh import Hits, Mesh
-from kernels.surfaces import surface_hypotheses, surface_likelihood, surface_median
+from kernels.surfaces import (
+    fused_surfaces,
+    fused_surfaces_serves,
+    surface_hypotheses,
+    surface_likelihood,
+    surface_median,
+)
 
 __all__ = [
     "DecoderWeights",
@@ -20,6 +27,8 @@ __all__ = [
     "attend_neighbours",
     "fused_decode",
     "fused_decode_serves",
+    "fused_surfaces",
+    "fused_surfaces_serves",
     "gather_blend",
     "gather_neighbours",
     "interpolate_planes",

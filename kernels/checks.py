@@ -43,7 +43,7 @@ RANGE_FLOOR = 0.1
 # 0.03, 0.05 and 0.1, this gave `planes` the highest IoU at 128x2048 on scans held out of the training towns.
 PARTED = 0.03
 
-# The constants down to `TOLERANCE` are those of `kernels.surfaces`. A neighbour has 9 hypotheses: its surface is
+# The constants down to `TOLERANCE` are those of `kernels.surfaces.maths`. A neighbour has 9 hypotheses: its surface is
 # continued along its column with the outer pixel, with the inner one or not at all, and along its row likewise.
 KINDS = 9
 # Least bilinear area in their prior, so that a neighbour can be right where its area is 0.

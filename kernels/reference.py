@@ -14,6 +14,7 @@ from kernels.checks import (
     BACKGROUND,
     CONTINUED,
     FARTHEST,
+    KINDS,
     LEAST_RANGE,
     LEAST_SCALE,
     PARTED,
@@ -28,6 +29,7 @@ __all__ = [
     "attend_neighbours",
     "cast_rays",
     "fused_decode",
+    "fused_surfaces",
     "gather_blend",
     "gather_neighbours",
     "interpolate_planes",
@@ -173,17 +175,39 @@ def fused_decode(
     eps: float,
 ) -> torch.Tensor:
     """`kernels.fused_decode`: a `Projected`, image (B, H, W), queries (B, Q, 2) and `DecoderWeights`."""
+    image, queries = image.to(projected.pixels.dtype), queries.to(projected.pixels.dtype)
+    scores = _decoded(projected, queries, weights, wrap, eps).squeeze(-1)
+    return gather_blend(image, queries, scores, prior, wrap, area_floor)[0]
+
+
+def fused_surfaces(
+    projected: Any,
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    elevations: torch.Tensor,
+    azimuths: torch.Tensor,
+    weights: Any,
+    wrap: bool,
+    eps: float,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """`kernels.fused_surfaces`, arguments as in `fused_decode`, and both tables."""
+    image, queries, elevations, azimuths = (
+        tensor.to(projected.pixels.dtype) for tensor in (image, queries, elevations, azimuths)
+    )
+    scores, scales = _decoded(projected, queries, weights, wrap, eps).split((KINDS, 1), -1)
+    return surface_median(image, queries, elevations, azimuths, wrap, scores, scales.squeeze(-1))
+
+
+def _decoded(projected: Any, queries: torch.Tensor, weights: Any, wrap: bool, eps: float) -> torch.Tensor:
+    """What the head of a decoder says of each neighbour, (B, Q, 4, N)."""
     pixels, slope, shift, gram, heads = projected
     weight, bias = weights.output
     weight = weight[:, torch.arange(len(bias), device=bias.device).view(heads, -1).T.reshape(-1)]
-    image, queries = image.to(pixels.dtype), queries.to(pixels.dtype)
     t = neighbour_attention(pixels, queries, slope, shift, gram, weight, bias, heads, eps, wrap)
     hidden = F.gelu(F.linear(F.layer_norm(t, bias.shape, weights.norm[0], weights.norm[1], eps), *weights.hidden))
     t = t + F.linear(hidden, *weights.back)
-    scores = F.linear(
-        F.layer_norm(t, bias.shape, weights.head_norm[0], weights.head_norm[1], eps), *weights.score
-    ).squeeze(-1)
-    return gather_blend(image, queries, scores, prior, wrap, area_floor)[0]
+    t = F.layer_norm(t, bias.shape, weights.head_norm[0], weights.head_norm[1], eps)
+    return F.linear(t, *weights.score)
 
 
 def cast_rays(
@@ -221,7 +245,7 @@ def cast_rays(
 
 
 def _continued(u: torch.Tensor, other: torch.Tensor, gap: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    """u(α) - u_t of `kernels.surfaces`, Eq. (1), with α and α_o counted from t; 0 where it cannot be continued."""
+    """u(α) - u_t of `kernels.surfaces.maths`, Eq. (1), with angles counted from t; 0 where it cannot be continued."""
     can = (u > 0) & (other > 0) & (gap != 0) & (gap.abs() <= WIDEST_GAP)
     sine = gap.where(can, 1.0).sin()
     return ((u * (gap - angle).sin() + other * angle.sin()) / sine - u).where(can, 0.0)
@@ -256,7 +280,7 @@ def surface_hypotheses(
 
 
 def _log_weights(queries: torch.Tensor, scores: torch.Tensor) -> torch.Tensor:
-    """Log w_tk of `kernels.surfaces`, Eq. (3), (B, Q, 4, 9)."""
+    """Log w_tk of `kernels.surfaces.maths`, Eq. (3), (B, Q, 4, 9)."""
     prior = areas(queries).clamp(min=AREA_FLOOR).log()
     return (scores + prior.unsqueeze(-1)).flatten(-2).log_softmax(-1).view(scores.shape)
 

@@ -7,10 +7,12 @@ Read in this order:
 - `maths`: the derivation, and the functions that all kernels share.
 - `heads`: kernels whose threads take one head of one query. For CUDA, float64 and any number of channels.
 - `vectors`: kernels whose threads take all heads of a query, as vectors. For CPUs, float32 and the paper's 8 heads.
-- `decoder`: `fused_decode`, the step and all that follows it up to the range. For inference on CPUs.
+- `block`: the step and the feed-forward layer behind it, a few queries at a time. For inference on CPUs.
+- `decoder`: `fused_decode`, the block and all that follows it up to the range.
 """
 
-from kernels.neighbour_attention.decoder import DecoderWeights, fused_decode, fused_decode_serves
+from kernels.neighbour_attention.block import DecoderWeights
+from kernels.neighbour_attention.decoder import fused_decode, fused_decode_serves
 from kernels.neighbour_attention.op import neighbour_attention
 from kernels.neighbour_attention.table import Projected, project_pixels
 

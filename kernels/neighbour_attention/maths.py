@@ -30,7 +30,7 @@ from typing import Any
 import warp as wp
 
 from kernels.checks import FARTHEST
-from kernels.lanes import LANES, exp2, fold, total, vectors, zeros4, zeros16
+from kernels.lanes import LANES, add_product, fold, softmax4, total, vectors, zeros4, zeros16
 from kernels.stencil import Grid, neighbour, offset
 
 __all__ = [
@@ -163,7 +163,8 @@ def stencil(table: Any, queries: wp.array2d[Any], n: int):
 @wp.func
 def _affine(table: Any, around: Any, t: int, c: int):
     """Block c of A + B q, or of z + Wq + b, for neighbour t."""
-    return table.pixels[around.pixel[t], c] + table.slope[0, c] * around.down[t] + table.slope[1, c] * around.right[t]
+    still = add_product(table.pixels[around.pixel[t], c], table.slope[0, c], around.down[t])
+    return add_product(still, table.slope[1, c], around.right[t])
 
 
 @wp.func
@@ -180,29 +181,18 @@ def _attention_map(
         q = zeros4(zero)
         k = zeros4(zero)
         for t in range(4):
-            q[t] = _affine(table, around, t, c) * around.inverse[t] + table.shift[c]
-            k[t] = _affine(table, around, t, blocks + c) * around.inverse[t] + table.shift[blocks + c]
+            q[t] = add_product(table.shift[c], _affine(table, around, t, c), around.inverse[t])
+            k[t] = add_product(table.shift[blocks + c], _affine(table, around, t, blocks + c), around.inverse[t])
         for i in range(4):
             for j in range(4):
-                logits[4 * i + j] += wp.cw_mul(q[i], k[j])
+                logits[4 * i + j] = add_product(logits[4 * i + j], q[i], k[j])
     log2_e = type(table.eps)(1.4426950408889634)
     scale = log2_e / wp.sqrt(type(table.eps)(table.channels // table.heads))
     p = logits
-    for i in range(table.rolled_four):
-        l0 = fold(p[4 * i]) * scale
-        l1 = fold(p[4 * i + 1]) * scale
-        l2 = fold(p[4 * i + 2]) * scale
-        l3 = fold(p[4 * i + 3]) * scale
-        largest = wp.max(wp.max(l0, l1), wp.max(l2, l3))
-        l0 = exp2(l0 - largest)
-        l1 = exp2(l1 - largest)
-        l2 = exp2(l2 - largest)
-        l3 = exp2(l3 - largest)
-        whole = (l0 + l1) + (l2 + l3)
-        p[4 * i] = wp.cw_div(l0, whole)
-        p[4 * i + 1] = wp.cw_div(l1, whole)
-        p[4 * i + 2] = wp.cw_div(l2, whole)
-        p[4 * i + 3] = wp.cw_div(l3, whole)
+    for i in range(4):
+        weights = softmax4(p[4 * i], p[4 * i + 1], p[4 * i + 2], p[4 * i + 3], scale)
+        for j in range(4):
+            p[4 * i + j] = weights[j]
     return p
 
 
@@ -223,10 +213,11 @@ def attend(
         v = zeros4(table.pixels.dtype())
         for t in range(4):
             value = _affine(table, around, t, 2 * blocks + c)
-            v[t] = value * around.inverse[t] + table.shift[2 * blocks + c]
+            v[t] = add_product(table.shift[2 * blocks + c], value, around.inverse[t])
         for t in range(4):
-            mixed = wp.cw_mul(p[4 * t], v[0]) + wp.cw_mul(p[4 * t + 1], v[1])
-            mixed = mixed + wp.cw_mul(p[4 * t + 2], v[2]) + wp.cw_mul(p[4 * t + 3], v[3])
+            mixed = wp.cw_mul(p[4 * t], v[0])
+            for j in range(1, 4):
+                mixed = add_product(mixed, p[4 * t + j], v[j])
             attended_out[row + t, c] = mixed
             token = _affine(table, around, t, 3 * blocks + c)
             tokens_out[row + t, c] = token

@@ -169,10 +169,10 @@ _step, _step_backward = (
 
 
 def fits(pixels: torch.Tensor, dtype: torch.dtype, channels: int, heads: int) -> bool:
-    """Whether these kernels serve: float32 on a CPU, 8 heads, C a multiple of 64, and a result in `dtype`."""
+    """Whether these kernels serve: float32 on a CPU, 8 heads, C a multiple of 16, and a result in `dtype`."""
     return (
         heads == HEADS
-        and channels % (4 * LANES) == 0
+        and channels % LANES == 0
         and pixels.device.type == "cpu"
         and pixels.dtype == torch.float32
         and dtype in _STORED

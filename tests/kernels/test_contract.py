@@ -18,6 +18,7 @@ from kernels import (
     area_blend,
     attend_neighbours,
     fused_decode,
+    fused_surfaces,
     gather_blend,
     gather_neighbours,
     interpolate_planes,
@@ -71,6 +72,12 @@ def whole_decoder(features, queries, qkv_weight, image):
     norm, matrix = (qkv_weight[0], qkv_weight[1]), (qkv_weight[:64], qkv_weight[2])
     weights = DecoderWeights(matrix, norm, matrix, matrix, norm, (qkv_weight[:1], qkv_weight[0, :1]))
     return fused_decode(project(8, features, qkv_weight), image, queries, weights, "bilinear")
+
+
+def whole_surfaces(features, qkv_weight, *rays):
+    norm, matrix = (qkv_weight[0], qkv_weight[1]), (qkv_weight[:64], qkv_weight[2])
+    weights = DecoderWeights(matrix, norm, matrix, matrix, norm, (qkv_weight[:10], qkv_weight[0, :10]))
+    return fused_surfaces(project(8, features, qkv_weight), *rays, weights)[0]
 
 
 RAYS = ("image", "queries", "elevations", "azimuths")
@@ -139,6 +146,7 @@ CASES = {
 OTHERS = {
     "interpolate_planes": Case(interpolate_planes, ("image", "queries")),
     "fused_decode": Case(whole_decoder, ("features", "queries", "qkv_weight", "image")),
+    "fused_surfaces": Case(whole_surfaces, ("features", "qkv_weight", *RAYS)),
     "surface_hypotheses": Case(surface_hypotheses, RAYS),
     "surface_median": Case(lambda *tensors: surface_median(*tensors)[0], (*RAYS, "hypothesis_scores", "scores")),
 }
@@ -157,7 +165,7 @@ def case(request):
 
 @pytest.fixture(params=EVERY)
 def every_case(request, device):
-    if request.param == "fused_decode" and device.type == "cuda":
+    if request.param in ("fused_decode", "fused_surfaces") and device.type == "cuda":
         pytest.skip("serves CPUs only")
     return EVERY[request.param]
 

@@ -46,7 +46,7 @@ def draw(channels=C, count=500, height=5, width=16):
     return projected, image, queries, weights
 
 
-@pytest.mark.parametrize("channels", [64, 128])
+@pytest.mark.parametrize("channels", [32, 64, 80, 128])
 @pytest.mark.parametrize("prior", PRIORS)
 @pytest.mark.parametrize("wrap", [True, False])
 def test_is_the_decoder_layer_by_layer(channels, prior, wrap, poisoned):

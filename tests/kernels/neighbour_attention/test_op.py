@@ -14,7 +14,7 @@ TOLERANCE = {torch.float32: 1e-5, torch.float64: 1e-12}
 HALF = 1e-2
 
 # Channels and heads: the paper's, which CPUs do in vectors, and such as they do one head at a time.
-SIZES = [(64, 8), (128, 8), (12, 3), (64, 4)]
+SIZES = [(32, 8), (64, 8), (128, 8), (12, 3), (64, 4)]
 
 
 def draw_step(device, dtype=torch.float64, channels=12, heads=3, count=60):

@@ -7,7 +7,7 @@ import torch
 from ilnet.sensor import Sensor, preset
 from kernels import surface_hypotheses, surface_likelihood, surface_median
 from kernels.checks import BACKGROUND, KINDS, TOLERANCE
-from kernels.surfaces import _surface_hypotheses, _surface_likelihood, _surface_median
+from kernels.surfaces.op import _surface_hypotheses, _surface_likelihood, _surface_median
 
 # Relative, of ranges that are differences of inverse ranges, and of logarithms of densities. The kernel's
 # sine is good to 3e-8.
