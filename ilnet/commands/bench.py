@@ -32,13 +32,22 @@ from ilnet.scan import Scan
 from ilnet.sensor import PAPER_INPUT, PAPER_TARGET, Sensor, preset
 from ilnet.world import places, simulate
 from ilnet.world.simulate import best_device
-from kernels import area_blend, gather_blend, neighbour_attention, project_pixels, reference
+from kernels import (
+    area_blend,
+    fused_surfaces,
+    fused_surfaces_serves,
+    gather_blend,
+    neighbour_attention,
+    project_pixels,
+    reference,
+    surface_median,
+)
 
 __all__ = ["SECTIONS", "Row", "peak_memory", "run", "table"]
 
 LARGE = (256, 4096)
 TOWN = "town01"
-# Queries of an op: those of a frame, or a quarter of them where each has 4 tokens of 64 channels.
+# Queries of an op: those of a frame, or a quarter of them where each has 4 tokens or 36 hypotheses.
 BLENDS, TOKENS = 262_144, 65_536
 TRAIN_SCANS, TRAIN_QUERIES = 4, 16_384
 # Scans cast in one call: a GPU has room for several.
@@ -176,6 +185,35 @@ def ops() -> Iterator[Row]:
         leaves,
         device,
     )
+    yield from _surfaces(some, device)
+
+
+def _surfaces(queries: torch.Tensor, device: torch.device) -> Iterator[Row]:
+    """Times what answers queries (1, Q, 2) over surfaces."""
+    source = PAPER_INPUT
+    model: Any = models.create("iln-surfaces").eval().to(device)
+    nn.init.normal_(model.head[1].weight, std=0.3)  # untrained scores are all 0
+    image = torch.rand(1, *source.shape, device=device) * 70 + 3
+    with torch.no_grad():
+        encoded = model.encode(image, source.wrap, source)
+        scores, scales = model.scores(encoded, queries, source.wrap)
+    rays = encoded.measured, queries, *source.angles(device)
+
+    def median(backend: str = "warp") -> torch.Tensor:
+        return surface_median(*rays, scores, scales, source.wrap, backend)[0]
+
+    def decoder(backend: str = "warp") -> torch.Tensor:
+        return fused_surfaces(encoded.projected, *rays, model.decoder_weights(), source.wrap, backend=backend)[0]
+
+    works = {"surface_median": median}
+    if fused_surfaces_serves(encoded.projected):
+        works["fused_surfaces"] = decoder
+    for name, work in works.items():
+        others = {"eager torch": _no_gradients(partial(work, "torch"))}
+        compiled = _compiled(partial(work, "torch"), device)
+        if compiled is not None:
+            others["torch.compile"] = _no_gradients(compiled)
+        yield from _compare(name, f"{TOKENS} queries", _no_gradients(work), others, repeat=5)
 
 
 def _both(
@@ -282,6 +320,27 @@ def frame() -> Iterator[Row]:
                 for words, chunk in chunks.items()
             }
             for row in _compare(f"frame-{precision}", size, ours, plain):
+                row.peak_mb = peak
+                yield row
+
+
+def surfaces_frame() -> Iterator[Row]:
+    """Times a frame of `iln-surfaces`, from the scan to the ranges, beside the same network on the plain twins."""
+    device = best_device()
+    torch.manual_seed(0)
+    scan, _ = demo.from_town()
+    ours, plain = (models.create("iln-surfaces").eval().to(device) for _ in range(2))
+    plain.load_state_dict(ours.state_dict())
+    plain.backend = "torch"
+    for precision in models.PRECISIONS:
+        for wanted in (PAPER_TARGET, PAPER_TARGET.resize(*LARGE)):
+            work, other = (
+                partial(_frame, models.Upsampler(model, scan.sensor, wanted, precision, device), scan)
+                for model in (ours, plain)
+            )
+            peak = peak_memory(work, device)
+            size = f"{scan.sensor.size} -> {wanted.size}"
+            for row in _compare(f"surfaces-frame-{precision}", size, work, {"the same in plain PyTorch": other}):
                 row.peak_mb = peak
                 yield row
 
@@ -452,7 +511,13 @@ def _status(entry: str) -> int:
     raise OSError(f"/proc/self/status has no {entry}")
 
 
-SECTIONS: dict[str, Callable[[], Iterator[Row]]] = {"ops": ops, "frame": frame, "train": train, "rays": rays}
+def frames() -> Iterator[Row]:
+    """Times frames of `iln` and of `iln-surfaces`."""
+    yield from frame()
+    yield from surfaces_frame()
+
+
+SECTIONS: dict[str, Callable[[], Iterator[Row]]] = {"ops": ops, "frame": frames, "train": train, "rays": rays}
 
 
 def run(sections: tuple[str, ...]) -> list[Row]:

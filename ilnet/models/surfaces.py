@@ -1,7 +1,7 @@
 """ILN over surfaces: attention among the neighbours weighs what their surfaces say, and predicts how well they know it.
 
 The paper's network weighs the ranges of the 4 neighbours. This one continues the surface that each neighbour lies on in
-several ways, and weighs the ranges at which these are met along the query (`kernels.surfaces`).
+several ways, and weighs the ranges at which these are met along the query (`kernels.surfaces.maths`).
 """
 
 from typing import NamedTuple
@@ -13,7 +13,16 @@ from ilnet.models.base import OFFSET_SCALE, Answer, Model
 from ilnet.models.encoder import Encoder
 from ilnet.models.iln import Block
 from ilnet.sensor import Sensor
-from kernels import Projected, neighbour_attention, project_pixels, surface_likelihood, surface_median
+from kernels import (
+    DecoderWeights,
+    Projected,
+    fused_surfaces,
+    fused_surfaces_serves,
+    neighbour_attention,
+    project_pixels,
+    surface_likelihood,
+    surface_median,
+)
 from kernels.checks import KINDS
 
 __all__ = ["Surfaces", "describe"]
@@ -92,7 +101,7 @@ class Surfaces(Model):
     Raises:
         ValueError: If the heads do not divide the tokens.
 
-    Source: ours; `kernels.surfaces` has the equations.
+    Source: ours; `kernels.surfaces.maths` has the equations.
     """
 
     tells_confidence = True
@@ -131,7 +140,7 @@ class Surfaces(Model):
     def scores(self, encoded: _Encoded, queries: torch.Tensor, wrap: bool) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns a score for each hypothesis (B, Q, 4, 9) and a scale for each neighbour (B, Q, 4).
 
-        `kernels.surfaces` says how the scale becomes the width of a hypothesis.
+        `kernels.surfaces.maths` says how the scale becomes the width of a hypothesis.
         """
         out = self.block.attention.out
         t = neighbour_attention(encoded.projected, queries, (out.weight, out.bias), wrap, backend=self.backend)
@@ -144,10 +153,25 @@ class Surfaces(Model):
 
     def answer(self, encoded: _Encoded, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> Answer:
         """Returns what `decode` returns, and how likely the surface of each neighbour is met there."""
-        scores, scales = self.scores(encoded, queries, wrap)
-        angles = encoded.sensor.angles(image.device)
-        ranges, support, _ = surface_median(encoded.measured, queries, *angles, scores, scales, wrap, self.backend)
+        measured, projected, sensor = encoded
+        rays = measured, queries, *sensor.angles(image.device)
+        if self.is_fused(encoded):  # all in one kernel
+            ranges, support, _ = fused_surfaces(projected, *rays, self.decoder_weights(), wrap)
+        else:
+            scores, scales = self.scores(encoded, queries, wrap)
+            ranges, support, _ = surface_median(*rays, scores, scales, wrap, self.backend)
         return Answer(ranges.where(ranges > 0, encoded.sensor.norm_range), support, support.sum(-1))
+
+    def is_fused(self, encoded: _Encoded) -> bool:
+        """Returns whether the whole decoder is one kernel: in inference, if `fused_surfaces` can run."""
+        inference = self.backend == "warp" and not torch.is_grad_enabled()
+        return inference and fused_surfaces_serves(encoded.projected)
+
+    def decoder_weights(self) -> DecoderWeights:
+        """Returns the weights behind the attention, as `fused_surfaces` takes them."""
+        norm, hidden, _, _, back, _ = self.block.feed_forward
+        layers = (self.block.attention.out, norm, hidden, back, *self.head)
+        return DecoderWeights(*((layer.get_parameter("weight"), layer.get_parameter("bias")) for layer in layers))
 
     def loss(
         self,
