@@ -296,6 +296,17 @@ def test_intensity_and_confidence_do_not_depend_on_the_chunk(name, yard, monkeyp
 
 
 @pytest.mark.parametrize("name", ["planes", "iln-surfaces"])
+def test_both_backends_blend_alike(name, yard):
+    model, scan, target = any_model(name), painted(yard, preset("paper-16x1024")), preset("paper-64x1024")
+    ours = model.upsample(scan, target)
+    model.backend = "torch"
+    theirs = model.upsample(scan, target)
+    same = (ours.ranges - theirs.ranges).abs() < METRES
+    assert same.float().mean() > 0.99  # a median may jump
+    assert (ours.intensity - theirs.intensity).abs()[same].max() < 1e-3
+
+
+@pytest.mark.parametrize("name", ["planes", "iln-surfaces"])
 def test_intensity_meets_itself_at_the_seam(name, yard):
     model, sensor = any_model(name), preset("paper-16x1024").resize(16, 64)
     scan, between = painted(yard, sensor), replace(sensor, azimuths=sensor.azimuths + np.pi / 64)
