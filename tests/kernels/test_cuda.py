@@ -1,4 +1,4 @@
-"""What can be said of CUDA where there is none: every kernel compiles for it."""
+"""What can be said of CUDA where there is none: every kernel that it launches compiles for it."""
 
 import gc
 import sys
@@ -21,16 +21,16 @@ MODULES = [
     "rays.mesh",
     "rays.projection",
     "scatter",
-    "surfaces.decoder",
     "surfaces.float32x1",
-    "surfaces.float32x16",
     "surfaces.float64x1",
 ]
+# Kernels with 36 vectors of 16 lanes for each query, which are launched on CPUs only; CUDA has those of one lane.
+CPU_ONLY = ["surfaces.decoder", "surfaces.float32x16"]
 
 
 def test_the_list_is_whole():
-    every = {kernel.module.name for kernel in gc.get_objects() if isinstance(kernel, wp.Kernel)}
-    assert {f"kernels.{name}" for name in MODULES} == {name for name in every if name.startswith("kernels.")}
+    every = {kernel.module.name for kernel in gc.get_objects() if type(kernel) is wp.Kernel}
+    assert {f"kernels.{name}" for name in MODULES + CPU_ONLY} == {name for name in every if name.startswith("kernels.")}
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp has no CUDA compiler on macOS")
