@@ -89,7 +89,7 @@ def test_demo_of_a_scan_is_judged_against_its_own_rows(tmp_path, scan_file):
     assert result["methods"]["bilinear-inverse"]["mae"] < result["methods"]["nearest"]["mae"]
 
 
-EVALUATED = {"model", "size", "scans", "mae", "iou", "precision", "recall", "f1", "floating", "edge_mae"}
+EVALUATED = {"model", "size", "scans", "mae", "iou", "precision", "recall", "f1", "floating", "edge_mae", "chamfer"}
 
 
 def test_evaluate_measures_models_at_positions_in_a_mesh(command, tmp_path, mesh_file):
@@ -98,7 +98,7 @@ def test_evaluate_measures_models_at_positions_in_a_mesh(command, tmp_path, mesh
     done = ilnet(*scene, "--model", "nearest", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     nearest = json.loads(done.stdout)
-    assert set(nearest) == EVALUATED
+    assert set(nearest) == EVALUATED | {"mae_interval", "iou_interval"}
     assert (nearest["model"], nearest["size"], nearest["scans"]) == ("nearest", "32x512", 2)
     assert "2/2" in done.stderr
     _, out, _ = command(*scene, "--model", "nearest", "--model", "bilinear-inverse", "--scans", 1)
@@ -126,7 +126,8 @@ def test_evaluate_in_a_town_prints_a_table(command):
     methods = ("--model", "iln-surfaces", "--model", "nearest")
     code, out, _ = command("evaluate", *methods, "--scene", "town01", "--size", "32x512", "--scans", 2)
     assert code == 0
-    rows = {line.split()[0]: [float(word) for word in line.split()[1:]] for line in out.splitlines()[-2:]}
+    table = out.partition("95 % intervals")[0].strip().splitlines()[-2:]
+    rows = {line.split()[0]: [float(word) for word in line.split()[1:]] for line in table}
     assert rows["iln-surfaces"][0] < rows["nearest"][0]
 
 
@@ -196,7 +197,7 @@ BAD = {
         "sensor is 'vlp-61'; it should be one of",
     ),
     "unwritable folder": (["demo", "--scan", "good.npz", "--rows", "4", "--out", "text.ply"], "text.ply"),
-    "no scene": (["evaluate", "--model", "iln"], "--scene TOWN|MESH or --scan FILE"),
+    "no scene": (["evaluate", "--model", "iln"], "--scene TOWN|MESH, --scan FILE or --protocol kitti FILE"),
     "no such scene": ([*SCENE, "town99"], "town99 is neither a town (town01"),
     "mesh without positions": ([*SCENE, "yard.ply"], "needs --at FILE"),
     "town with positions": ([*SCENE, "town01", "--at", "at.json"], "--at goes with a mesh"),
