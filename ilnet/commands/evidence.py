@@ -27,17 +27,18 @@ _SENSORS = (
     Sensor(np.deg2rad(np.linspace(-30.67, 10.67, 32)), _EVEN_TURN, 1.0, 100.0, 120.0, name="hdl-32e"),
     preset("hdl-64e"),
     preset("os0-128"),
-    # Beams lie the closer the nearer they are to the horizon: 0.4° apart there, and 3.5° and more at both ends.
+    # Beams are 0.6° apart at the horizon, 2.4° at the bottom and 1.5° at the top.
     Sensor(np.deg2rad(7 * np.sinh(np.linspace(-2, 1.5, 40))), _EVEN_TURN, 0.5, 120.0, 150.0, name="uneven-40"),
 )
 
 
 def surfaces(study: Study) -> None:
-    """Ours: small `iln-surfaces`, one part replaced by the paper's in each variant, and what an oracle reaches.
+    """Ours: a small `iln-surfaces` for the paper's input sensor, one part replaced in each variant, and oracles.
 
-    *ranges* weighs the 4 measured ranges instead of 36 continued ones. *L1* trains by the error of the weighted mean
-    and answers with it; *mean* answers so with the weights of *surfaces*. *one sensor* learns from the paper's input
-    sensor alone, and *one channel* sees nothing but the range. The oracle chooses knowing the truth.
+    *ranges* weighs the 4 measured ranges, as the paper does, instead of 36 continued ones. *L1* trains by the error of
+    the weighted mean and answers with it; *mean* answers so with the weights of *surfaces*. *one channel* sees nothing
+    but the range. *any sensor* learns from sensors that are made up, in as many steps. An oracle knows the truth and
+    chooses the nearest of what the network may choose from.
     """
     rows, sizes = [], study.sizes[:2]
     for seed in range(study.seeds):

@@ -295,7 +295,7 @@ def ratios(done: Mapping[str, Sequence[dict[str, Any]]]) -> list[dict[str, str]]
                     add(figure, cases[model, *case], cases["planes", *case], key)
     variants = evidence.means(done.get("surfaces", ()))
     for variant, size in variants:
-        if variant in ("ranges", "L1", "mean", "one sensor", "one channel"):
+        if variant in ("ranges", "L1", "mean", "one channel", "any sensor"):
             figure = f"IoU of surfaces over that of its variant {variant}, {size}"
             add(figure, variants["surfaces", size], variants[variant, size], "iou")
     return found

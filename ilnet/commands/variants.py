@@ -89,12 +89,13 @@ def from_one_channel(**arguments: Any) -> models.Surfaces:
     return model
 
 
+_ONE_SENSOR = {"sensors": [PAPER_INPUT]}
 VARIANTS: Mapping[str, Mapping[str, Any]] = {
-    "surfaces": {},
-    "ranges": {"make": from_ranges},
-    "L1": {"make": Blended},
-    "one sensor": {"sensors": [PAPER_INPUT]},
-    "one channel": {"make": from_one_channel},
+    "surfaces": _ONE_SENSOR,
+    "ranges": {"make": from_ranges, **_ONE_SENSOR},
+    "L1": {"make": Blended, **_ONE_SENSOR},
+    "one channel": {"make": from_one_channel, **_ONE_SENSOR},
+    "any sensor": {},
 }
 """Arguments of `train.train` for each variant: what the network weighs, learns from and sees."""
 
