@@ -170,7 +170,7 @@ def _without_least(answers: Sequence[Scan], truths: Sequence[Scan]) -> dict[str,
         mean = metrics.ScanMetrics().to(truths[0].ranges.device)
         for scan, truth in zip(scans, truths, strict=True):
             mean.update(scan.ranges, truth)
-        figures |= {key + words: mean.compute()[key].item() for key in ("floating", "recall", "precision", "iou")}
+        figures |= {key + words: mean.compute()[key].item() for key in ("floating", "recall", "iou")}
     return figures
 
 
