@@ -46,7 +46,7 @@ PARTED = 0.03
 # The constants down to `TOLERANCE` are those of `kernels.surfaces.maths`. A neighbour has 9 hypotheses: its surface is
 # continued along its column with the outer pixel, with the inner one or not at all, and along its row likewise.
 KINDS = 9
-# Least bilinear area in their prior, so that a neighbour can be right where its area is 0.
+# Least bilinear area in their prior, so that a neighbour can be right where its area is 0, but for queries on a pixel.
 AREA_FLOOR = 1e-3
 # Probability that a measured range is explained by no hypothesis, and the same for a no return (ε).
 BACKGROUND = 1e-3

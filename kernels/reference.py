@@ -279,9 +279,16 @@ def surface_hypotheses(
     return (1 / found).where(u > 0, 0.0).flatten(-2)
 
 
+def surface_areas(queries: torch.Tensor) -> torch.Tensor:
+    """The prior of the neighbours in Eq. (3) of `kernels.surfaces.maths`: (..., 4) for queries (..., 2)."""
+    found = areas(queries)
+    floor = torch.where(found.amax(-1, keepdim=True) < 1 - AREA_FLOOR, AREA_FLOOR, 0.0).to(found)
+    return torch.where(found < AREA_FLOOR, floor, found)
+
+
 def _log_weights(queries: torch.Tensor, scores: torch.Tensor) -> torch.Tensor:
     """Log w_tk of `kernels.surfaces.maths`, Eq. (3), (B, Q, 4, 9)."""
-    prior = areas(queries).clamp(min=AREA_FLOOR).log()
+    prior = surface_areas(queries).log()
     return (scores + prior.unsqueeze(-1)).flatten(-2).log_softmax(-1).view(scores.shape)
 
 

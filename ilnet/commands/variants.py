@@ -17,7 +17,7 @@ from ilnet.learning import metrics
 from ilnet.scan import Pair
 from ilnet.sensor import PAPER_INPUT, Sensor
 from kernels import reference, surface_hypotheses
-from kernels.checks import AREA_FLOOR, KINDS
+from kernels.checks import KINDS
 
 __all__ = ["SIZE", "VARIANTS", "Blended", "blended", "ceilings", "from_one_channel", "from_ranges"]
 
@@ -46,7 +46,7 @@ class Blended(models.Surfaces):
     def decode(self, encoded: Any, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Returns the weighted means (B, Q) [m]."""
         scores, _ = self.scores(encoded, queries, wrap)
-        prior = reference.areas(queries).clamp(min=AREA_FLOOR).log().unsqueeze(-1)
+        prior = reference.surface_areas(queries).log().unsqueeze(-1)
         weights = (scores + prior).flatten(-2).softmax(-1)
         return (weights * _hypotheses(image, queries, encoded.sensor, wrap).flatten(-2)).sum(-1)
 

@@ -22,6 +22,8 @@ A network gives each hypothesis a score s_tk and each neighbour a scale c_t. The
 
     w_tk = softmax(s_tk + log max(a_t, 0.001)),    b_t = 0.5 log(1 + exp c_t) + 0.02 m                               (3)
 
+On a pixel, to a thousandth of its distance to the next, the other areas count as 0: what was measured is answered.
+
 The range r of a query then has the following density, a mixture of Laplace distributions, and nothing returns with the
 following probability:
 
@@ -257,12 +259,17 @@ def hypotheses(rays: Any, b: int, row: Any, column: Any, zeros: Any):
 
 @wp.func
 def _areas(row: Any, column: Any, t: int):
-    """The bilinear area of neighbour t, at least `AREA_FLOOR`; NaN stays."""
+    """The prior of neighbour t in Eq. (3): its bilinear area, bounded below; NaN stays."""
     a = type(row)()
+    largest = type(row)()
     for i in range(len(row)):
         a[i] = area(row[i], column[i], t)
+        for s in range(4):
+            largest[i] = wp.max(largest[i], area(row[i], column[i], s))
+    zero = type(row)()
     floor = type(row)(type(row[0])(_AREA_FLOOR))
-    return where_less(a, floor, floor, a)
+    between = type(row)(type(row[0])(1.0)) - floor
+    return where_less(a, floor, where_less(largest, between, floor, zero), a)
 
 
 @wp.func

@@ -161,6 +161,23 @@ def test_the_median_is_a_hypothesis_with_half_of_the_weight_on_either_side():
     assert (support.sum(-1) <= 1).all()
 
 
+@pytest.mark.parametrize("backend", ["warp", "torch"])
+def test_what_was_measured_is_answered_on_a_pixel_and_may_be_overruled_beside_it(backend):
+    image, _, elevations, azimuths, *_ = draw(batch=1)
+    rows, columns = torch.meshgrid(torch.arange(HEIGHT - 1.0), torch.arange(WIDTH - 1.0), indexing="ij")
+    pixels = torch.stack((rows, columns), -1).view(1, -1, 2)
+    # The other three neighbours have far higher scores than the pixel itself.
+    scores = torch.full((1, len(pixels[0]), 4, KINDS), 12.0)
+    scores[:, :, 0] = 0.0
+    measured = image[:, :-1, :-1].flatten(1)
+    for beside, same in ((0.0, True), (1e-6, True), (0.01, False)):
+        answer, _, none = surface_median(
+            image, pixels + beside, elevations, azimuths, scores, scores[..., 0], backend=backend
+        )
+        assert torch.allclose(answer, measured, rtol=1e-3) == same
+        assert torch.equal((none > 0.99) & (measured == 0), measured == 0) == same
+
+
 def test_the_sum_of_the_support_is_the_probability_of_being_right_to_a_decimetre():
     image, queries, *others = draw(dtype=torch.float64, batch=1, count=30)
     elevations, azimuths, scores, scales, _ = others
