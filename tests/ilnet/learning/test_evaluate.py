@@ -1,9 +1,10 @@
 import pytest
+import torch
 
 from ilnet import models
 from ilnet.learning import evaluate
 from ilnet.scan import Scan
-from ilnet.sensor import PAPER_INPUT
+from ilnet.sensor import PAPER_INPUT, preset
 from ilnet.world import simulate
 
 
@@ -51,3 +52,13 @@ def test_interval_of_few_values():
     assert evaluate.interval([0.5]) is None
     assert evaluate.interval([0.5, float("nan")]) is None
     assert evaluate.interval([0.5, 0.5]) == (0.5, 0.5)
+
+
+def test_any_sensor_is_predicted_from_any_other_in_a_town(monkeypatch, quiet_place):
+    monkeypatch.setattr(simulate, "best_device", lambda: torch.device("cpu"))
+    monkeypatch.setattr(evaluate.places, "town", lambda name, device: quiet_place([[3, 0, 0], [3, 5, 0], [0, 9, 0]]))
+    other = preset("vlp-16")
+    for arguments, source in (((), PAPER_INPUT), ((other.decimate(8),), other.decimate(8))):
+        [(scan, truth)] = evaluate.town_pairs("town07", 1, other, *arguments)
+        assert (scan.sensor, truth.sensor) == (source, other)
+    assert torch.equal(scan.ranges, truth.decimate(8).ranges)  # from the same place
