@@ -544,10 +544,10 @@ def _table(methods: dict[str, dict[str, Any]]) -> str:
         "floating": "floating",
         "edge_mae": "at edges",
     }
-    columns |= {"chamfer": "Chamfer [m]"} if all("chamfer" in figures for figures in methods.values()) else {}
+    columns |= {"chamfer": "Chamfer"} if all("chamfer" in figures for figures in methods.values()) else {}
     width = max(18, *map(len, methods))
-    lines = [f"{'method':{width}}" + "".join(f"{title:>12}" for title in columns.values())]
-    lines += [f"{name:{width}}" + "".join(f"{figures[c]:12.3f}" for c in columns) for name, figures in methods.items()]
+    lines = [f"{'method':{width}}" + "".join(f"{title:>11}" for title in columns.values())]
+    lines += [f"{name:{width}}" + "".join(f"{figures[c]:11.3f}" for c in columns) for name, figures in methods.items()]
     return "\n".join(lines)
 
 
