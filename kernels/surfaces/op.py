@@ -26,7 +26,7 @@ from kernels.stencil import query_of
 from kernels.surfaces.maths import RAYS, explain, hypotheses, load, scale, settle, store, weigh
 from kernels.vmap import refuse
 
-__all__ = ["surface_hypotheses", "surface_likelihood", "surface_median"]
+__all__ = ["rays_of", "surface_hypotheses", "surface_likelihood", "surface_median"]
 
 _BACKGROUND = wp.constant(BACKGROUND)
 
