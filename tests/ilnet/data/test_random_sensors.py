@@ -28,7 +28,7 @@ def test_sensors_are_of_many_kinds():
     assert min(gap.mean() for gap in gaps) < 0.6
     assert max(gap.mean() for gap in gaps) > 3
     assert len({sensor.shape for sensor in others}) > 20
-    assert min(sensor.max_range for sensor in others) < 70 < 150 < max(sensor.max_range for sensor in others)
+    assert min(sensor.max_range for sensor in others) < 70 < 110 < max(sensor.max_range for sensor in others)
 
 
 def test_every_sensor_is_upright_and_goes_full_circle():

@@ -379,7 +379,7 @@ def test_as_the_authors_train(tmp_path, quick, monkeypatch, name, halved):
     sensors = {size: preset(f"paper-{size}") for size in ("16x1024", "64x1024")}
     archive = data.Archive.create(tmp_path / "data", 2, sensors, {"towns": ["nowhere"]})
     images = {size: np.full((2, *sensor.shape), 5000, np.uint16) for size, sensor in sensors.items()}
-    images["16x1024"][..., 0] = 700
+    images["16x1024"][..., 0] = 1500
     archive.write(0, images, np.zeros(2, int), np.zeros(2, int), np.zeros((2, 4, 4)))
     size = dataclasses.replace(train.PRESETS["tiny"], steps=0, epochs=4, halve_after=(2,), columns=1024)
     monkeypatch.setitem(train.PRESETS, "tiny", size)

@@ -42,7 +42,7 @@ def draw_or_spoil(self, number):
 
 data.ContinuousRays._draw = draw_or_spoil
 try:
-    figures = train.train("iln", "tiny", out, steps=2, features=16, heads=4)
+    figures = train.train("iln", "tiny", out, steps=2, precision="32-true", features=16, heads=4)
 except ValueError as error:
     (out / f"rank-{rank}.txt").write_text(str(error))
 else:
