@@ -31,7 +31,7 @@ import torch
 from ilnet.scan import OF_RETURNS, Scan, real_tensor
 from ilnet.sensor import Sensor, preset
 
-__all__ = ["UnknownSensor", "listed", "read", "write"]
+__all__ = ["UnknownSensor", "kitti_points", "listed", "read", "write"]
 
 
 def read(path: str | Path, sensor: Sensor | None = None) -> Scan:
@@ -147,11 +147,21 @@ def _read_npy(path: Path, sensor: Sensor | None) -> Scan:
 
 
 def _read_bin(path: Path, sensor: Sensor | None) -> Scan:
+    columns = kitti_points(path).T
+    return _from_columns(dict(zip((*_XYZ, "intensity"), columns, strict=True)), sensor or preset("hdl-64e"))
+
+
+def kitti_points(path: Path) -> np.ndarray:
+    """Returns the points in a `.bin` file of KITTI, in its order: (N, 4) float32, x, y, z [m] and intensity.
+
+    Raises:
+        OSError: If the file cannot be read.
+        ValueError: If it holds anything else; the message continues "path: ".
+    """
     data = path.read_bytes()
     if not data or len(data) % 16:
         raise ValueError(f"its {len(data)} bytes are not whole KITTI points of 16 bytes (float32 x, y, z, intensity)")
-    points = np.frombuffer(data, "<f4").reshape(-1, 4)
-    return _from_columns(dict(zip((*_XYZ, "intensity"), points.T, strict=True)), sensor or preset("hdl-64e"))
+    return np.frombuffer(data, "<f4").reshape(-1, 4)
 
 
 _XYZ = ("x", "y", "z")

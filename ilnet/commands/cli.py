@@ -470,7 +470,7 @@ def towns(names: tuple[str, ...], out: Path) -> None:
 @click.argument("names", nargs=-1, type=click.Choice(_EXPERIMENTS))
 @click.option(
     "--preset",
-    help="Preset of each training. By default small; table, real, confidence and sensors use the networks that ship.",
+    help="Preset of each training. By default small; all that train nothing use the networks that ship.",
 )
 @click.option(
     "--out",

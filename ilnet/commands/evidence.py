@@ -8,16 +8,16 @@ from matplotlib.figure import Figure
 
 from ilnet import models
 from ilnet.commands import variants
-from ilnet.commands.study import SERIES, Study, grouped_bars, loaded
+from ilnet.commands.study import FIGURES, SERIES, Study, by_case, grouped_bars, loaded
 from ilnet.learning import calibration, evaluate, metrics, train
 from ilnet.scan import Scan
 from ilnet.sensor import PAPER_INPUT, Sensor, preset
 from ilnet.world import simulate
 
-__all__ = ["confidence", "means", "sensors", "spans", "surfaces"]
+__all__ = ["VARIANT_KEYS", "confidence", "means", "sensors", "surfaces"]
 
-# The figures that the variants are compared by.
-_FIGURES = {"iou": "IoU", "mae": "MAE [m]", "floating": "floating"}
+VARIANT_KEYS = "variant", "size"
+"""The columns that tell the cases of `surfaces` apart."""
 # Share of the returns that is left out, those with the least confidence.
 _LEFT_OUT = 0.1
 _EVEN_TURN = np.deg2rad(np.linspace(-180, 180, 1800, endpoint=False))
@@ -60,15 +60,15 @@ def surfaces(study: Study) -> None:
 
 
 def _brief(row: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: row[key] for key in ("size", "scans", *_FIGURES)}
+    return {key: row[key] for key in ("size", "scans", *FIGURES)}
 
 
 def _draw_variants(study: Study, rows: Sequence[Mapping[str, Any]]) -> None:
     """Draws the means of each figure over the seeds, and their spans."""
     figure = Figure(figsize=(10, 3.6), layout="constrained")
-    found = _by_variant(rows)
+    found = by_case(rows, VARIANT_KEYS)
     names, sizes = (list(dict.fromkeys(case)) for case in zip(*found, strict=True))
-    for axis, (key, words) in zip(figure.subplots(1, len(_FIGURES), sharey=True), _FIGURES.items(), strict=True):
+    for axis, (key, words) in zip(figure.subplots(1, len(FIGURES), sharey=True), FIGURES.items(), strict=True):
         for (name, size), figures in found.items():
             values, number = figures[key], sizes.index(size)
             at, colour = names.index(name) + 0.3 * number, SERIES[number]
@@ -84,33 +84,10 @@ def _draw_variants(study: Study, rows: Sequence[Mapping[str, Any]]) -> None:
     figure.savefig(study.out / "surfaces.png", dpi=120)
 
 
-def _by_variant(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str], dict[str, list[float]]]:
-    """Returns the figures of all seeds, by variant and size."""
-    found: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for row in rows:
-        figures = found.setdefault((row["variant"], row["size"]), {key: [] for key in _FIGURES})
-        for key, values in figures.items():
-            values.append(float(row[key]))
-    return found
-
-
-def means(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str], dict[str, float]]:
+def means(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, ...], dict[str, float]]:
     """Returns the mean of each figure over the seeds, by variant and size, given the rows of `surfaces`."""
-    found = _by_variant(rows)
+    found = by_case(rows, VARIANT_KEYS)
     return {case: {key: float(np.mean(values)) for key, values in of.items()} for case, of in found.items()}
-
-
-def spans(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Returns for each variant and size the means over the seeds and their spans, given the rows of `surfaces`."""
-    table = []
-    for (variant, size), figures in _by_variant(rows).items():
-        line: dict[str, Any] = {"variant": variant, "size": size}
-        for key, values in figures.items():
-            line[key] = f"{np.mean(values):.3f}"
-            if len(values) > 1:
-                line[key] += f" ({min(values):.3f} to {max(values):.3f})"
-        table.append(line)
-    return table
 
 
 def confidence(study: Study) -> None:

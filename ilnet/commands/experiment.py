@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from ilnet import data, models, scan_files
 from ilnet.commands import evidence, fair, plot
-from ilnet.commands.study import COLOURS, SERIES, Study, grouped_bars, loaded, made_with
+from ilnet.commands.study import COLOURS, SERIES, Study, grouped_bars, loaded, made_with, spans
 from ilnet.learning import evaluate
 from ilnet.sensor import PAPER_INPUT, format_size
 from ilnet.world import towns
@@ -311,10 +311,8 @@ def _shown(name: str, rows: Sequence[dict[str, Any]]) -> Sequence[dict[str, Any]
     if name == "convergence":
         last = max(int(row["step"]) for row in rows)
         return [row for row in rows if int(row["step"]) == last]
-    if name == "surfaces":
-        return evidence.spans(rows)
-    if name == "fair":
-        return fair.spread(rows)
+    if name in (keys := {"surfaces": evidence.VARIANT_KEYS, "fair": fair.FAIR_KEYS}):
+        return spans(rows, keys[name])
     return _beside_the_paper(rows) if name == "table" else rows
 
 

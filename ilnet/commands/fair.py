@@ -24,19 +24,21 @@ from matplotlib.figure import Figure
 from torch import nn
 
 from ilnet import models, scan_files
-from ilnet.commands.study import SERIES, Study, grouped_bars, loaded
+from ilnet.commands.study import FIGURES, SERIES, Study, by_case, grouped_bars, loaded
 from ilnet.learning import evaluate
 from ilnet.models import ILN, LIIF
 from ilnet.scan import Scan
 from ilnet.world import simulate
 from kernels import area_blend, gather_blend, gather_neighbours
 
-__all__ = ["DECODERS", "KINDS", "REHEARSAL", "STARTS", "alignment", "fair", "rehearsing", "spread", "variant"]
+__all__ = ["DECODERS", "FAIR_KEYS", "KINDS", "REHEARSAL", "STARTS", "alignment", "fair", "rehearsing", "variant"]
 
 KINDS = ("values", "corrections", "weights")
 DECODERS = {"MLP": "liif", "attention": "iln"}
 """The decoders, and the models that have them."""
 STARTS = ("as the paper", "from bilinear")
+FAIR_KEYS = "kind", "decoder", "start", "size"
+"""The columns that tell the cases of `fair` apart."""
 REHEARSAL = 200
 """Steps in which values learn bilinear interpolation before they start from it."""
 
@@ -44,7 +46,6 @@ REHEARSAL = 200
 # decoder takes about as long.
 _SIZE = {"MLP": {"features": 32, "blocks": 8, "hidden": 128}, "attention": {"features": 32, "blocks": 8}}
 _TRAINING = {"steps": 1000, "validations": 2, "precision": "32-true"}
-_FIGURES = {"iou": "IoU", "mae": "MAE [m]", "floating": "floating"}
 
 
 def _answer(
@@ -134,7 +135,7 @@ def fair(study: Study) -> None:
         case = {"kind": kind, "decoder": decoder, "start": start, "seed": seed}
         model = _trained(study, kind, decoder, start, seed)
         for row in study.compare({kind: model}):
-            rows.append(case | {key: row[key] for key in ("size", "scans", *_FIGURES)})
+            rows.append(case | {key: row[key] for key in ("size", "scans", *FIGURES)})
     study.write("fair", rows)
     _draw(study, rows)
 
@@ -181,31 +182,9 @@ def alignment(study: Study) -> None:
     grouped_bars(study, "alignment", labelled, [f"{row['scan']}\nfrom every fourth row" for row in rows])
 
 
-def _by_case(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str, str, str], dict[str, list[float]]]:
-    """Returns the figures of all seeds, by kind, decoder, start and size."""
-    found: dict[tuple[str, str, str, str], dict[str, list[float]]] = {}
-    for row in rows:
-        case = row["kind"], row["decoder"], row["start"], row["size"]
-        figures = found.setdefault(case, {key: [] for key in _FIGURES})
-        for key, values in figures.items():
-            values.append(float(row[key]))
-    return found
-
-
-def spread(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Returns for each case the means over the seeds and their spans, given the rows of `fair`."""
-    table = []
-    for (kind, decoder, start, size), figures in _by_case(rows).items():
-        line: dict[str, Any] = {"kind": kind, "decoder": decoder, "start": start, "size": size}
-        for key, values in figures.items():
-            line[key] = f"{np.mean(values):.3f} ({min(values):.3f} to {max(values):.3f})"
-        table.append(line)
-    return table
-
-
 def _draw(study: Study, rows: Sequence[Mapping[str, Any]]) -> None:
     """Draws the IoU of each case at each size: means over the seeds, and their spans."""
-    found = _by_case(rows)
+    found = by_case(rows, FAIR_KEYS)
     sizes = list(dict.fromkeys(size for *_, size in found))
     figure = Figure(figsize=(10, 3.2), layout="constrained")
     cases = list(product(DECODERS, STARTS))

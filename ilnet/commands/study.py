@@ -18,10 +18,13 @@ from ilnet.scan import Pair
 from ilnet.sensor import PAPER_INPUT, Sensor
 from ilnet.world import simulate, towns
 
-__all__ = ["COLOURS", "SERIES", "Study", "grouped_bars", "loaded", "made_with"]
+__all__ = ["COLOURS", "FIGURES", "SERIES", "Study", "by_case", "grouped_bars", "loaded", "made_with", "spans"]
 
 # Experiments that compare the networks that ship, unless a preset is given to train others.
 _SHIPPED = "table", "real", "confidence", "sensors", "alignment"
+
+FIGURES = {"iou": "IoU", "mae": "MAE [m]", "floating": "floating"}
+"""The figures that are compared over several seeds, and what they are called."""
 
 # Distinguishable for the colour-blind, and in print.
 SERIES = "#0072b2", "#e69f00", "#009e73", "#cc79a7"
@@ -174,3 +177,26 @@ def grouped_bars(study: Study, name: str, rows: Sequence[dict[str, Any]], cases:
     axis.set_ylabel("IoU")
     axis.legend(fontsize=8)
     figure.savefig(study.out / f"{name}.png", dpi=120)
+
+
+def by_case(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[tuple[str, ...], dict[str, list[float]]]:
+    """Returns the `FIGURES` of all seeds, by the values of `keys`, given rows of an experiment."""
+    found: dict[tuple[str, ...], dict[str, list[float]]] = {}
+    for row in rows:
+        figures = found.setdefault(tuple(row[key] for key in keys), {name: [] for name in FIGURES})
+        for name, values in figures.items():
+            values.append(float(row[name]))
+    return found
+
+
+def spans(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> list[dict[str, Any]]:
+    """Returns for each case of `by_case` the means over the seeds and, of several seeds, their spans."""
+    table = []
+    for case, figures in by_case(rows, keys).items():
+        line: dict[str, Any] = dict(zip(keys, case, strict=True))
+        for name, values in figures.items():
+            line[name] = f"{np.mean(values):.3f}"
+            if len(values) > 1:
+                line[name] += f" ({min(values):.3f} to {max(values):.3f})"
+        table.append(line)
+    return table

@@ -83,10 +83,10 @@ def files(paths: Sequence[Path]) -> list[Path]:
 
 def _points(path: Path) -> np.ndarray:
     """Returns the finite points (N, 3) of a file, in its order [m]."""
-    data = path.read_bytes()
-    if not data or len(data) % 16:
-        raise ValueError(f"{path}: its {len(data)} bytes are not whole KITTI points of float32 x, y, z, intensity")
-    points = np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
+    try:
+        points = scan_files.kitti_points(path)[:, :3].astype(np.float64)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     return points[np.isfinite(points).all(1)]
 
 

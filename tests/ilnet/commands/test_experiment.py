@@ -9,7 +9,7 @@ import torch
 
 from ilnet import data, models, scan_files
 from ilnet.commands import cli, evidence, experiment, fair, variants
-from ilnet.commands.study import Study
+from ilnet.commands.study import Study, spans
 from ilnet.learning import evaluate, metrics, train
 from ilnet.sensor import PAPER_INPUT, preset
 from ilnet.world import simulate
@@ -169,8 +169,8 @@ def test_every_part_of_surfaces_is_taken_away_once_and_beside_them_stands_an_ora
 def test_means_and_spans_by_hand():
     seeds = [{"variant": "L1", "size": "64x1024", "iou": str(v), "mae": "2", "floating": "0.1"} for v in (0.3, 0.5)]
     assert evidence.means(seeds) == {("L1", "64x1024"): {"iou": pytest.approx(0.4), "mae": 2.0, "floating": 0.1}}
-    assert evidence.spans(seeds)[0]["iou"] == "0.400 (0.300 to 0.500)"
-    assert evidence.spans(seeds[:1])[0]["iou"] == "0.300"
+    assert spans(seeds, evidence.VARIANT_KEYS)[0]["iou"] == "0.400 (0.300 to 0.500)"
+    assert spans(seeds[:1], evidence.VARIANT_KEYS)[0]["iou"] == "0.300"
 
 
 def test_confidence_and_other_sensors(study, monkeypatch):

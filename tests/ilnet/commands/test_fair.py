@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ilnet import models
-from ilnet.commands import fair
+from ilnet.commands import fair, study
 from ilnet.commands.fair import DECODERS, KINDS, STARTS, rehearsing, variant
 from ilnet.sensor import PAPER_INPUT
 from ilnet.world import simulate
@@ -90,6 +90,6 @@ def test_the_loss_is_that_of_the_answers_and_reaches_all_weights(asked):
 def test_spread_has_means_and_spans():
     row = {"kind": "weights", "decoder": "MLP", "start": STARTS[0], "size": "64x1024", "mae": 1.0, "floating": 0.1}
     rows = [row | {"seed": seed, "iou": iou} for seed, iou in enumerate((0.2, 0.3, 0.4))]
-    [line] = fair.spread(rows)
+    [line] = study.spans(rows, fair.FAIR_KEYS)
     assert line["iou"] == "0.300 (0.200 to 0.400)"
     assert line["mae"] == "1.000 (1.000 to 1.000)"
