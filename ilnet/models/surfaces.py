@@ -89,7 +89,8 @@ def describe(measured: torch.Tensor, sensor: Sensor, wrap: bool) -> torch.Tensor
 class Surfaces(Model):
     """r̂ = the weighted median of the ranges at which the surfaces of the 4 neighbours are met; for any sensor.
 
-    A query on a pixel gets what was measured there. It needs the sensor of each image. No return is filled with that sensor's `norm_range`, and predicted as it.
+    It needs the sensor of each image. No return is filled with that sensor's `norm_range`, and predicted as it. A query
+    on a pixel gets what was measured there.
 
     Args:
         features: Channels of the encoder.
