@@ -11,6 +11,7 @@ import torch
 from ilnet import scan_files
 from ilnet.scan import Scan
 from ilnet.scan_files import read, write
+from ilnet.scan_files.pcd import lzf
 from ilnet.sensor import Sensor, preset
 
 from .toy import ROUND_TRIP, SENSOR, bright, predicted, toy
@@ -234,16 +235,16 @@ def test_pcd_binary_compressed(tmp_path):
 def test_lzf_copies():
     """Copies, by hand: 3 bits of length less 2 (7: a byte more follows), 13 bits of distance less 1."""
     copy_4_from_3_back = bytes([(2 << 5) | 0, 2])
-    assert scan_files._lzf(b"\x02abc" + copy_4_from_3_back, 7) == b"abcabca"  # reads what it writes
+    assert lzf(b"\x02abc" + copy_4_from_3_back, 7) == b"abcabca"  # reads what it writes
     copy_20_from_1_back = bytes([(7 << 5) | 0, 11, 0])
-    assert scan_files._lzf(b"\x00z" + copy_20_from_1_back + b"\x00!", 22) == b"z" * 21 + b"!"
+    assert lzf(b"\x00z" + copy_20_from_1_back + b"\x00!", 22) == b"z" * 21 + b"!"
     far = bytes(range(256)) + bytes(64)
     literals = b"".join(b"\x1f" + far[i : i + 32] for i in range(0, 320, 32))
     copy_3_from_300_back = bytes([(1 << 5) | (299 >> 8), 299 & 255])
-    assert scan_files._lzf(literals + copy_3_from_300_back, 323) == far + bytes([20, 21, 22])
+    assert lzf(literals + copy_3_from_300_back, 323) == far + bytes([20, 21, 22])
     for damaged in (b"\x20\x05", b"\x00a\xe0", b"\x05abc", b"\x00a\x20"):
         with pytest.raises(ValueError, match="compressed data is damaged"):
-            scan_files._lzf(damaged, 6)
+            lzf(damaged, 6)
 
 
 def test_ply_ascii_and_big_endian(tmp_path):
