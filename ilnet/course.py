@@ -1,4 +1,4 @@
-"""What the notebooks share: checks of exercises, 3-D scenes, drawings of threads. Needs the extra `course`."""
+"""What the notebooks share: checks of exercises, sliders, 3-D scenes, drawings of threads. Needs the extra `course`."""
 
 import io
 import os
@@ -6,13 +6,14 @@ from collections.abc import Callable, Sequence
 from html import escape
 from typing import Any, NamedTuple
 
+import ipywidgets
 import PIL.Image
 from IPython.display import HTML, Image
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 
-__all__ = ["Cells", "check", "draw_thread", "show_scene"]
+__all__ = ["Cells", "check", "draw_thread", "show_scene", "slide"]
 
 # Inches: the width of a drawing, and the side of an array element in it.
 _WIDTH, _CELL = 9.0, 0.17
@@ -40,6 +41,25 @@ def check(checks: Callable[[], object]) -> None:
         print("Right.")
 
 
+def slide(draw: Callable[..., object], **values: tuple[float, float, float]) -> None:
+    """Shows what `draw` draws, in a Jupyter session with sliders to move, elsewhere at the middle of their ranges.
+
+    Args:
+        draw: Draws a picture for numbers that it takes by name.
+        values: The first, the last and the step of each number.
+    """
+    if _somebody_is_there():
+        ipywidgets.interact(draw, **values)
+        return
+    # Sliders need a running kernel, and nbclient sometimes freezes on them (its issue 312).
+    middle = {name: first + (last - first) / step // 2 * step for name, (first, last, step) in values.items()}
+    draw(**{name: type(values[name][0])(value) for name, value in middle.items()})
+
+
+def _somebody_is_there() -> bool:
+    return "JPY_SESSION_NAME" in os.environ or "VSCODE_PID" in os.environ
+
+
 def show_scene(plotter: Any) -> HTML | Image:
     """Shows a PyVista scene: in a Jupyter session one that turns with the mouse, elsewhere a picture.
 
@@ -49,7 +69,7 @@ def show_scene(plotter: Any) -> HTML | Image:
     Returns:
         The scene as HTML, or a picture. A cell that ends with this call shows it.
     """
-    if "JPY_SESSION_NAME" in os.environ or "VSCODE_PID" in os.environ:  # a person is there to turn it
+    if _somebody_is_there():
         width, height = plotter.window_size
         page = escape(plotter.trame.export_html(None).getvalue())
         plotter.close()

@@ -37,10 +37,9 @@ import math
 
 import matplotlib.pyplot as plt
 import torch
-from ipywidgets import interact
 
 from ilnet import places, simulate
-from ilnet.course import Cells, check, draw_thread
+from ilnet.course import Cells, check, draw_thread, slide
 from ilnet.sensor import angles_to_directions, preset
 from kernels import gather_blend, gather_neighbours
 
@@ -468,10 +467,10 @@ draw_edge(edge=0.2)
 # *In words: the near wall now ends before the dotted ray, and the truth lies on the far wall. Bilinear and perspective
 # stay where they were, at 18 m and 13.6 m.*
 #
-# In a running notebook, move both yourself:
+# In a running notebook, sliders move both:
 
 # %%
-_ = interact(draw_edge, edge=(0.0, 1.0, 0.05), offset=(0.0, 1.0, 0.05))
+slide(draw_edge, edge=(0.0, 1.0, 0.05), offset=(0.0, 1.0, 0.05))
 
 # %% [markdown]
 # The edge moves nothing but the truth: **the four ranges do not contain it.** Right is 10 m or 30 m, and the blends say

@@ -37,11 +37,10 @@ from itertools import islice
 
 import matplotlib.pyplot as plt
 import torch
-from ipywidgets import interact
 from torch import nn
 
 from ilnet import data, metrics, models, places
-from ilnet.course import check
+from ilnet.course import check, slide
 from ilnet.models.encoder import Encoder
 from ilnet.sensor import preset
 from kernels import area_blend, gather_blend, gather_neighbours
@@ -425,10 +424,10 @@ draw_walk()
 # almost straight slopes; ILN's curve comes closer to both levels and is steeper between them. Right, its weights as
 # stacked bands: those of the left neighbours shrink on the way and those of the right ones grow.*
 #
-# Other edges (in a running notebook):
+# Another edge. In a running notebook a slider shows all of them:
 
 # %%
-_ = interact(draw_walk, number=(0, len(edges) - 1, 1))
+slide(draw_walk, number=(0, len(edges) - 1, 1))
 
 # %% [markdown]
 # After so short a training the step is still soft. See what `FAST = False` makes of it. Scores are continuous in the

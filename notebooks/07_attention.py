@@ -41,7 +41,6 @@ import math
 import time
 from pathlib import Path
 
-import ipywidgets
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
@@ -51,7 +50,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 import ilnet
 from ilnet import data, metrics, models, places
-from ilnet.course import Cells, check, draw_thread
+from ilnet.course import Cells, check, draw_thread, slide
 from ilnet.models.base import OFFSET_SCALE
 from ilnet.sensor import angles_to_directions, preset
 from kernels import attend_neighbours, gather_neighbours, neighbour_attention, project_pixels
@@ -929,11 +928,11 @@ assert on_left[-1] < 0.1
 # surroundings look like; the image does not tell where in the cell the edge lies. But on either side of it the answer
 # is a surface that is there.
 #
-# Move the row with the slider: at rows of pixels (9.0) and between them, and below row 5, where rays meet the road
-# before they reach the wall. (The slider works where a kernel runs.)
+# Another row. In a running notebook a slider moves it: look at rows of pixels (9.0) and between them, and below row 5,
+# where rays meet the road before they reach the wall.
 
 # %%
-_ = ipywidgets.interact(draw_edge, row=(2.0, 14.75, 0.25))
+slide(draw_edge, row=(2.0, 14.75, 0.25))
 
 # %% [markdown]
 # ## Summary

@@ -30,7 +30,6 @@ from nbformat import NotebookNode
 HERE = Path(__file__).parent
 TIMEOUT = 600  # seconds for one cell, on a machine that is busy with other work
 PICTURE_WIDTH = 640  # pixels
-WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
 def tagged(cell: NotebookNode, tag: str) -> bool:
@@ -98,11 +97,6 @@ def execute(made: NotebookNode, folder: str) -> None:
         record_timing=False,
         coalesce_streams=True,
     ).execute()
-    # Sliders need a running kernel. In a stored notebook they show an error message.
-    made.metadata.pop("widgets", None)
-    for cell in made.cells:
-        if cell.cell_type == "code":
-            cell.outputs = [output for output in cell.outputs if WIDGET not in output.get("data", {})]
 
 
 def draw_goal(made: NotebookNode, file: Path) -> None:

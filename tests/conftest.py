@@ -1,9 +1,15 @@
 """What all tests share."""
 
+import os
 from pathlib import Path
 
 import pytest
 import torch
+
+# Each of the processes that run tests, and what they start, gets its share of the cores.
+THREADS = max(1, (os.cpu_count() or 1) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)))
+os.environ.setdefault("OMP_NUM_THREADS", str(THREADS))
+torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
 
 # Measurements that serve the tests but do not travel with the project.
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"

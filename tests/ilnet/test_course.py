@@ -3,13 +3,14 @@ import os
 import subprocess
 import sys
 
+import ipywidgets
 import numpy as np
 import PIL.Image
 import pytest
 import pyvista
 from IPython.display import Image
 
-from ilnet.course import Cells, check, draw_thread, show_scene
+from ilnet.course import Cells, check, draw_thread, show_scene, slide
 
 
 def test_a_check_says_right_or_not_yet_and_raises_what_is_wrong(capsys):
@@ -35,6 +36,23 @@ def test_a_check_says_right_or_not_yet_and_raises_what_is_wrong(capsys):
         @check
         def _():
             raise NotImplementedError("Could not run 'aten::bmm'")
+
+
+def test_sliders_where_somebody_sits_and_elsewhere_their_middle(monkeypatch):
+    monkeypatch.delenv("JPY_SESSION_NAME", raising=False)
+    monkeypatch.delenv("VSCODE_PID", raising=False)
+    drawn, shown = [], []
+    monkeypatch.setattr(ipywidgets, "interact", lambda draw, **values: shown.append(values))
+    values = {"edge": (0.0, 1.0, 0.05), "number": (0, 11, 1), "row": (2.0, 14.75, 0.25)}
+    slide(lambda **at: drawn.append(at), **values)
+    [at] = drawn
+    assert at == pytest.approx({"edge": 0.5, "number": 5, "row": 8.25})
+    assert isinstance(at["number"], int)  # it may be an index
+    assert shown == []
+    monkeypatch.setenv("JPY_SESSION_NAME", "a notebook")
+    slide(lambda **at: drawn.append(at), **values)
+    assert len(drawn) == 1
+    assert shown == [values]
 
 
 @pytest.fixture

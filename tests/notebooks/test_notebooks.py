@@ -30,7 +30,8 @@ def shows(code):
     """Whether it prints or draws, other than in functions that it only defines."""
     top = [node for node in ast.parse(code).body if not isinstance(node, ast.FunctionDef | ast.ClassDef)]
     calls = [node.func for statement in top for node in ast.walk(statement) if isinstance(node, ast.Call)]
-    return any(getattr(call, "id", getattr(call, "attr", "")) in ("print", "show", "display") for call in calls)
+    names = {getattr(call, "id", getattr(call, "attr", "")) for call in calls}
+    return not names.isdisjoint(("print", "show", "display", "slide"))
 
 
 def cells(notebook):
