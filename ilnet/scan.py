@@ -13,10 +13,11 @@ from ilnet.sensor import Sensor, directions_to_angles
 
 __all__ = ["OF_RETURNS", "Pair", "Scan", "real_tensor"]
 
-# The fields of a scan that hold a value from 0 to 1 for each return, and what to do about other values.
+# The fields of a scan that hold a value from 0 on for each return: the largest value, and what to do about others.
 OF_RETURNS = {
-    "intensity": "divide it by the largest that the sensor reports",
-    "confidence": "they should be probabilities",
+    "intensity": (1.0, "divide it by the largest that the sensor reports"),
+    "confidence": (1.0, "they should be probabilities"),
+    "time": (86400.0, "it should be seconds since the first return"),
 }
 
 
@@ -30,19 +31,25 @@ class Scan:
         intensity: (H, W) strength of each return, from 0 to 1; None where it was not measured.
         confidence: (H, W) probability of each return that its range is right to 10 cm, from 0 to 1, in a scan that was
             predicted; None where nobody told it.
+        time: (H, W) when each return was measured, in seconds since the first of the scan; None where it is not known.
+        seen: (H, W) bool, False where the sensor never looked, such as in holes of a projection; a return cannot be
+            there. None, and so it is stored, if it looked everywhere. A pixel that is seen and holds no return is sky,
+            or absorbs the laser.
 
-    Intensity and confidence are those of returns: they are stored as 0 where there is none. They are float32, on the
-    device of `ranges`.
+    Intensity, confidence and time are those of returns: they are stored as 0 where there is none, as float32. All are
+    on the device of `ranges`.
 
     Raises:
-        ValueError: If the shapes differ, a range is NaN, infinite or negative, or intensity or confidence is not in
-            [0, 1].
+        ValueError: If the shapes differ, a range is NaN, infinite or negative, intensity or confidence is not in
+            [0, 1], time is negative or beyond a day, `seen` is not bool, or a return is where it is False.
     """
 
     ranges: torch.Tensor
     sensor: Sensor
     intensity: torch.Tensor | None = None
     confidence: torch.Tensor | None = None
+    time: torch.Tensor | None = None
+    seen: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         ranges = real_tensor("ranges", self.ranges).float()
@@ -62,30 +69,53 @@ class Scan:
                 "store 0 where nothing came back"
             )
         object.__setattr__(self, "ranges", ranges)
-        for name, remedy in OF_RETURNS.items():
-            object.__setattr__(self, name, self._of_returns(name, remedy))
+        for name in OF_RETURNS:
+            object.__setattr__(self, name, self._of_returns(name))
+        object.__setattr__(self, "seen", self._checked_seen())
 
-    def _of_returns(self, name: str, remedy: str) -> torch.Tensor | None:
-        """Returns a checked tensor of values from 0 to 1 as it is stored; None if the scan has none."""
+    def _of_returns(self, name: str) -> torch.Tensor | None:
+        """Returns a checked tensor of `OF_RETURNS` as it is stored; None if the scan has none."""
         if getattr(self, name) is None:
             return None
         values = real_tensor(name, getattr(self, name)).to(self.ranges)
-        if values.shape != self.ranges.shape:
-            raise ValueError(
-                f"{name} has shape {tuple(values.shape)}; it should be {tuple(self.ranges.shape)}, as ranges"
-            )
-        outside = ~((values >= 0) & (values <= 1))  # NaN too
+        self._check_shape(name, values)
+        largest, remedy = OF_RETURNS[name]
+        outside = ~((values >= 0) & (values <= largest))  # NaN too
         if outside.any():
-            raise ValueError(f"{name} has {int(outside.sum())} of {outside.numel()} values outside 0 to 1; {remedy}")
+            raise ValueError(
+                f"{name} has {int(outside.sum())} of {outside.numel()} values outside 0 to {largest:g}; {remedy}"
+            )
         return values.where(self.ranges > 0, 0.0)
+
+    def _checked_seen(self) -> torch.Tensor | None:
+        if self.seen is None:
+            return None
+        seen = torch.as_tensor(self.seen, device=self.ranges.device)
+        if seen.dtype != torch.bool:
+            raise ValueError(f"seen is of dtype {seen.dtype}; it should be bool")
+        self._check_shape("seen", seen)
+        unseen = ~seen & (self.ranges > 0)
+        if unseen.any():
+            raise ValueError(
+                f"seen is False at {int(unseen.sum())} of {int((self.ranges > 0).sum())} returns; "
+                "it should be True wherever something came back"
+            )
+        return None if seen.all() else seen
+
+    def _check_shape(self, name: str, image: torch.Tensor) -> None:
+        if image.shape != self.ranges.shape:
+            raise ValueError(
+                f"{name} has shape {tuple(image.shape)}; it should be {tuple(self.ranges.shape)}, as ranges"
+            )
 
     def _map(self, change: Callable[[torch.Tensor], torch.Tensor], sensor: Sensor) -> "Scan":
         """Returns a scan of `sensor`, with each tensor changed."""
-        others = (getattr(self, name) for name in OF_RETURNS)
-        return Scan(change(self.ranges), sensor, *(None if other is None else change(other) for other in others))
+        others = {name: getattr(self, name) for name in (*OF_RETURNS, "seen")}
+        changed = {name: None if image is None else change(image) for name, image in others.items()}
+        return Scan(change(self.ranges), sensor, **changed)
 
     def to(self, device: torch.device | str) -> "Scan":
-        """Returns the scan, with its intensity and confidence, on a device."""
+        """Returns the scan, with all that it has, on a device."""
         return self._map(lambda image: image.to(device), self.sensor)
 
     def points(self) -> torch.Tensor:
@@ -130,6 +160,7 @@ class Scan:
         sensor: Sensor,
         intensity: torch.Tensor | np.ndarray | None = None,
         confidence: torch.Tensor | np.ndarray | None = None,
+        time: torch.Tensor | np.ndarray | None = None,
     ) -> "Scan":
         """Returns the range image of a point cloud.
 
@@ -141,16 +172,17 @@ class Scan:
             sensor: The sensor that measured them.
             intensity: (N,) strength of each point, from 0 to 1.
             confidence: (N,) probability of each point that it is right to 10 cm.
+            time: (N,) seconds of each point since the first.
 
         Raises:
-            ValueError: If an argument has another shape, no point is in view, or a point in view has an intensity or
-                confidence that is not in [0, 1].
+            ValueError: If an argument has another shape, no point is in view, or a point in view has an intensity,
+                confidence or time that is out of its limits.
         """
         points = real_tensor("points", points)
         if points.ndim != 2 or points.shape[1] < 3:
             raise ValueError(f"points has shape {tuple(points.shape)}; it should be (N, 3 or more)")
         of_points: dict[str, torch.Tensor] = {}
-        for name, values in (("intensity", intensity), ("confidence", confidence)):
+        for name, values in (("intensity", intensity), ("confidence", confidence), ("time", time)):
             if values is not None:
                 of_points[name] = real_tensor(name, values).to(points.device, torch.float32)
                 if of_points[name].shape != points.shape[:1]:

@@ -5,17 +5,19 @@ A range of 0 means no return. Points are in the sensor frame, see `ilnet.sensor`
 `read` goes by the suffix:
 
 - `.npz`: `range` (H, W) [m], `elevation_deg` (H,) of the rows and `column_azimuth_deg` (W,) of the columns. Optional
-  are `min_range`, `max_range` and `norm_range` [m], by default the paper's 2, 80 and 100; `name`; and `intensity` and
-  `confidence` (H, W). A sensor given to `read` replaces all of these except range, intensity and confidence.
+  are `min_range`, `max_range` and `norm_range` [m], by default the paper's 2, 80 and 100; `name`; and `intensity`,
+  `confidence`, `time` and `seen` (H, W). A sensor given to `read` replaces the angles, the limits and the name.
 - `.npy`: ranges (H, W) of the sensor's shape, or points (N, 3) to (N, 8) that start with x, y, z. Needs a sensor.
 - `.bin`: KITTI's float32 x, y, z, intensity. The sensor is `hdl-64e` by default.
-- `.ply`: vertices with x, y, z, and perhaps `intensity` and `confidence`; ascii or binary. Needs a sensor.
-- `.pcd`: points with x, y, z, and perhaps `intensity` and `confidence`; ascii, binary or binary_compressed. Needs a
-  sensor; VIEWPOINT is not applied.
+- `.ply`: vertices with x, y, z, and perhaps `intensity`, `confidence` and `time`; ascii or binary. Needs a sensor.
+- `.pcd`: points with x, y, z, and perhaps `intensity`, `confidence` and `time`; ascii, binary or binary_compressed.
+  Needs a sensor; VIEWPOINT is not applied.
 
 An intensity beyond 1 is divided by 255; beyond 255, by 65535; and beyond that, by the largest in the file.
+Times are seconds, and count from the first if one is negative.
 
-`write` makes `.npz`, `.ply` and `.pcd`, with intensity and confidence where the scan has them.
+`write` makes `.npz`, `.ply` and `.pcd`, with intensity, confidence and time where the scan has them, and `.npz` with
+`seen`.
 """
 
 import os
@@ -85,7 +87,7 @@ def write(path: str | Path, scan: Scan) -> None:
 
     Args:
         path: The file; its suffix says the format.
-        scan: What is written, with its intensity and confidence where it has them.
+        scan: What is written, with all that it has.
 
     Raises:
         ValueError: If the suffix is unknown.

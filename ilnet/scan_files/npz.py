@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+import torch
 
 from ilnet.scan import OF_RETURNS, Scan, real_tensor
 from ilnet.scan_files.points import images_of, of_returns
@@ -21,7 +22,7 @@ def read(path: Path, sensor: Sensor | None) -> Scan:
     try:
         with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
             found = list(file.files)
-            wanted = ("range", "elevation_deg", "column_azimuth_deg", *OF_RETURNS, *limits)
+            wanted = ("range", "elevation_deg", "column_azimuth_deg", *OF_RETURNS, "seen", *limits)
             arrays = {key: file[key] for key in wanted if key in found}
     except Exception as error:  # zipfile, zlib and numpy raise many kinds on damaged archives
         raise ValueError(f"it cannot be unpacked: {error}") from error
@@ -33,7 +34,8 @@ def read(path: Path, sensor: Sensor | None) -> Scan:
     if sensor is None:
         elevations, azimuths = (real_tensor(key, arrays[key]).double().deg2rad().numpy() for key in needed[1:])
         sensor = Sensor(elevations, azimuths, **{key: arrays[key] for key in limits if key in arrays})
-    return Scan(real_tensor("range", arrays["range"]), sensor, **of_returns(arrays))
+    seen = torch.from_numpy(arrays["seen"]) if "seen" in arrays else None
+    return Scan(real_tensor("range", arrays["range"]), sensor, **of_returns(arrays), seen=seen)
 
 
 def write(file: BinaryIO, scan: Scan) -> None:
@@ -48,5 +50,6 @@ def write(file: BinaryIO, scan: Scan) -> None:
         norm_range=np.array(sensor.norm_range),
         name=np.array(sensor.name),
     )
-    arrays |= {name: image.cpu().numpy() for name, image in images_of(scan).items()}
+    images = images_of(scan) | ({} if scan.seen is None else {"seen": scan.seen})
+    arrays |= {name: image.cpu().numpy() for name, image in images.items()}
     np.savez_compressed(file, **arrays)

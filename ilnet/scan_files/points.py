@@ -58,12 +58,14 @@ def header_lines(file: BinaryIO, last: str) -> list[list[str]]:
 
 
 def of_returns(arrays: Mapping[str, np.ndarray]) -> dict[str, torch.Tensor]:
-    """Returns intensity and confidence as a scan takes them, as far as a file has them."""
+    """Returns intensity, confidence and time as a scan takes them, as far as a file has them."""
     found = {name: real_tensor(name, arrays[name]) for name in OF_RETURNS if name in arrays}
     if "intensity" in found:
         intensity = found["intensity"]
         largest = intensity.where(intensity.isfinite(), 0.0).max().item() if intensity.numel() else 0.0
         found["intensity"] = intensity / next((whole for whole in _WHOLES if largest <= whole), largest)
+    if "time" in found and found["time"].numel():
+        found["time"] = found["time"] - found["time"].min().clamp(max=0)
     return found
 
 
@@ -112,7 +114,7 @@ def from_records(body: bytes, fields: list[Field], count: int) -> dict[str, np.n
 
 
 def images_of(scan: Scan) -> dict[str, torch.Tensor]:
-    """Returns intensity and confidence, as far as the scan has them."""
+    """Returns intensity, confidence and time, as far as the scan has them."""
     return {name: image for name in OF_RETURNS if (image := getattr(scan, name)) is not None}
 
 

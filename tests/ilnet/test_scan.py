@@ -9,7 +9,7 @@ import torch
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
 
-from .toy import ROUND_TRIP, SENSOR, bright, predicted, toy
+from .toy import ROUND_TRIP, SENSOR, bright, complete, predicted, toy
 
 
 def test_points_by_hand():
@@ -81,6 +81,10 @@ def test_decimate_keeps_intensity_and_confidence_of_each_pixel():
     assert torch.equal(few.intensity, predicted().intensity[[0, 2, 3]][:, [0, 2]])
     assert torch.equal(few.confidence, predicted().confidence[[0, 2, 3]][:, [0, 2]])
     assert bright().decimate(3, 2).confidence is None
+    few = complete().decimate(4, 2)
+    assert torch.equal(few.time, complete().time[:, [0, 2]])
+    assert few.seen is None  # the hole is in a column that went
+    assert torch.equal(complete().decimate(2).seen, complete().seen[[0, 3]])
 
 
 @pytest.mark.parametrize("name", ["intensity", "confidence"])
@@ -97,12 +101,37 @@ def test_bad_intensity_and_confidence(name, values, message):
         Scan(toy().ranges, SENSOR, **{name: values})
 
 
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        ({"time": torch.full((4, 4), 1e9)}, "time has 16 of 16 values outside 0 to 86400; it should be seconds since"),
+        ({"time": -torch.ones(4, 4)}, "time has 16 of 16 values outside 0 to 86400"),
+        ({"seen": torch.ones(4, 4)}, "seen is of dtype torch.float32; it should be bool"),
+        ({"seen": torch.ones(4, 5, dtype=torch.bool)}, r"seen has shape \(4, 5\); it should be \(4, 4\)"),
+        ({"seen": np.zeros((4, 4), bool)}, "seen is False at 14 of 14 returns; it should be True wherever"),
+    ],
+)
+def test_bad_times_and_bad_holes(field, message):
+    with pytest.raises(ValueError, match=message):
+        Scan(toy().ranges, SENSOR, **field)
+
+
+def test_a_sensor_that_looked_everywhere_has_no_mask():
+    assert Scan(toy().ranges, SENSOR, seen=torch.ones(4, 4, dtype=torch.bool)).seen is None
+
+
+def test_points_keep_their_times():
+    points, time = toy().points(), torch.arange(14) / 100
+    found = Scan.from_points(points, SENSOR, time=time)
+    assert torch.equal(found.time[found.ranges > 0], time)
+
+
 def test_a_scan_moves_to_a_device_with_all_it_has(device):
-    found = predicted().to(device)
-    for name in ("ranges", "intensity", "confidence"):
+    found = complete().to(device)
+    for name in ("ranges", "intensity", "confidence", "time", "seen"):
         assert getattr(found, name).device.type == device.type
-        assert torch.equal(getattr(found, name).cpu(), getattr(predicted(), name))
-    assert found.sensor is predicted().sensor
+        assert torch.equal(getattr(found, name).cpu(), getattr(complete(), name))
+    assert found.sensor is complete().sensor
     assert toy().to(device).intensity is None
 
 
@@ -112,12 +141,13 @@ def test_a_scan_is_decimated_where_it_is(device):
 
 
 def test_only_confident_returns_stay():
-    scan = predicted()
+    scan = complete()
     found = scan.confident(0.5)
     stays = (scan.confidence >= 0.5) & (scan.ranges > 0)
     assert stays.sum() == 10  # of the first 11 pixels, one has no return
-    for name in ("ranges", "intensity", "confidence"):
+    for name in ("ranges", "intensity", "confidence", "time"):
         assert torch.equal(getattr(found, name), getattr(scan, name).where(stays, 0.0))
+    assert torch.equal(found.seen, scan.seen)
     assert torch.equal(scan.confident(0).ranges, scan.ranges)
     for least in (-0.1, 1.1, math.nan):
         with pytest.raises(ValueError, match=f"least is {least}; it should be from 0 to 1"):

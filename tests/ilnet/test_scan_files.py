@@ -14,7 +14,7 @@ from ilnet.scan_files import read, write
 from ilnet.scan_files.pcd import lzf
 from ilnet.sensor import Sensor, preset
 
-from .toy import ROUND_TRIP, SENSOR, bright, predicted, toy
+from .toy import ROUND_TRIP, SENSOR, bright, complete, predicted, toy
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "scans"
 REAL = [
@@ -25,19 +25,26 @@ REAL = [
 ]
 
 
-# Intensity and confidence
+# What a scan has beside its ranges
 
 
 @pytest.mark.parametrize("name", ["a.npz", "a.ply", "a.pcd"])
-@pytest.mark.parametrize("make", [toy, bright, predicted])
-def test_files_keep_intensity_and_confidence(tmp_path, name, make):
+@pytest.mark.parametrize("make", [toy, bright, predicted, complete])
+def test_files_keep_what_returns_have(tmp_path, name, make):
     scan = make()
     write(tmp_path / name, scan)
     found = read(tmp_path / name, None if name == "a.npz" else SENSOR)
     torch.testing.assert_close(found.ranges, scan.ranges, **ROUND_TRIP)
-    for of in ("intensity", "confidence"):
+    for of in ("intensity", "confidence", "time"):
         expected = getattr(scan, of)
         assert getattr(found, of) is None if expected is None else torch.equal(getattr(found, of), expected)
+    if name == "a.npz":
+        assert found.seen is None if scan.seen is None else torch.equal(found.seen, scan.seen)
+
+
+def test_times_before_that_of_the_header_count_from_the_first(tmp_path):
+    np.savez(tmp_path / "a.npz", range=toy().ranges.numpy(), time=complete().time.numpy() - 0.1)
+    torch.testing.assert_close(read(tmp_path / "a.npz", SENSOR).time, complete().time, rtol=0, atol=1e-7)
 
 
 def test_points_in_files_have_fields_that_others_know(tmp_path):

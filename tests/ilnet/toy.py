@@ -29,3 +29,10 @@ def bright() -> Scan:
 def predicted() -> Scan:
     """The bright toy with confidences 1, 0.95, ... 0.25, two of them where nothing returned."""
     return replace(bright(), confidence=1 - torch.arange(16).view(4, 4) / 20)
+
+
+def complete() -> Scan:
+    """The predicted toy with times 0, 0.01, ... 0.15 s; the sensor did not look at one pixel without a return."""
+    seen = torch.ones(4, 4, dtype=torch.bool)
+    seen[3, 3] = False
+    return replace(predicted(), time=torch.arange(16).view(4, 4) / 100, seen=seen)
