@@ -10,6 +10,8 @@ Here v(h) = (h + 1) R / 2 and Δ(h) = h R / 2, with R = `norm_range`. Each kind 
 perceptron (MLP) that sees one neighbour at a time, or ILN's, attention among the four. Each starts as in the paper or
 from bilinear interpolation: the last layer of corrections starts at zero, and so does that of weights, to whose h_t
 log a_t is added. Values first learn the answers of bilinear interpolation, for `REHEARSAL` steps that are not counted.
+
+Two cases more control what attention is worth: weights by ILN's decoder without its attention, and with all the rest.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,15 +29,30 @@ from ilnet import models, scan_files
 from ilnet.commands.study import FIGURES, SERIES, Study, by_case, grouped_bars, loaded
 from ilnet.learning import evaluate
 from ilnet.models import ILN, LIIF
+from ilnet.models.base import OFFSET_SCALE, normalised
 from ilnet.scan import Scan
+from ilnet.sensor import Sensor
 from ilnet.world import simulate
 from kernels import area_blend, gather_blend, gather_neighbours
 
-__all__ = ["DECODERS", "FAIR_KEYS", "KINDS", "REHEARSAL", "STARTS", "alignment", "fair", "rehearsing", "variant"]
+__all__ = [
+    "CONTROL",
+    "DECODERS",
+    "FAIR_KEYS",
+    "KINDS",
+    "REHEARSAL",
+    "STARTS",
+    "alignment",
+    "fair",
+    "rehearsing",
+    "variant",
+]
 
 KINDS = ("values", "corrections", "weights")
 DECODERS = {"MLP": "liif", "attention": "iln"}
 """The decoders, and the models that have them."""
+CONTROL = "feed-forward"
+"""What stays of the decoder with attention when its attention is taken away."""
 STARTS = ("as the paper", "from bilinear")
 FAIR_KEYS = "kind", "decoder", "start", "size"
 """The columns that tell the cases of `fair` apart."""
@@ -44,7 +61,8 @@ REHEARSAL = 200
 
 # One network apart from what is compared. LIIF's hidden layers are narrower than the paper's, so that a step of either
 # decoder takes about as long.
-_SIZE = {"MLP": {"features": 32, "blocks": 8, "hidden": 128}, "attention": {"features": 32, "blocks": 8}}
+_MODELS = DECODERS | {CONTROL: "iln"}
+_SIZE = {name: {"features": 32, "blocks": 8} | ({"hidden": 128} if name == "MLP" else {}) for name in _MODELS}
 _TRAINING = {"steps": 1000, "validations": 2, "precision": "32-true"}
 
 
@@ -59,6 +77,20 @@ def _answer(
         return area_blend((h + 1) * half, queries, model.backend)
     measured, _ = gather_neighbours(image.unsqueeze(1), queries, wrap, model.backend)
     return area_blend(measured.squeeze(-1) + h * half, queries, model.backend)
+
+
+class _FeedForward(ILN):
+    """ILN whose neighbours do not look at one another: D = 0, but with the feed-forward layer of D = 1."""
+
+    def encode(self, image: torch.Tensor, wrap: bool, sensor: Sensor | None = None) -> Any:
+        return self.encoder(normalised(image, self.norm_range), wrap)
+
+    def scores(self, encoded: Any, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
+        z, offsets = gather_neighbours(encoded, queries, wrap, self.backend)
+        z = z + self.position(offsets * OFFSET_SCALE)
+        for block in self.blocks:
+            z = z + block.feed_forward(z)  # type: ignore[operator]
+        return self.head(z).squeeze(-1)
 
 
 class _Compared:
@@ -87,11 +119,11 @@ def variant(kind: str, decoder: str, start: str, rehearsed: Path | None = None) 
 
     Args:
         kind: One of `KINDS`.
-        decoder: One of `DECODERS`.
+        decoder: One of `DECODERS`, or `CONTROL`.
         start: One of `STARTS`.
         rehearsed: The weights that values start from, where they start from bilinear interpolation.
     """
-    parent: type[models.Model] = {"liif": LIIF, "iln": ILN}[DECODERS[decoder]]
+    parent: type[models.Model] = {"MLP": LIIF, "attention": ILN, CONTROL: _FeedForward}[decoder]
     bilinear = start == STARTS[1]
     prior = "bilinear" if bilinear and kind == "weights" else "none"
     names = {"kind": kind, "prior": prior, "rehearses": False}
@@ -131,17 +163,18 @@ def fair(study: Study) -> None:
     Each is trained with either decoder and from either start, for 1000 steps in float32 on the same rays.
     """
     rows = []
-    for seed, kind, decoder, start in product(range(study.seeds), KINDS, DECODERS, STARTS):
+    cases = *product(KINDS, DECODERS, STARTS), *product(("weights",), (CONTROL,), STARTS)
+    for seed, (kind, decoder, start) in product(range(study.seeds), cases):
         case = {"kind": kind, "decoder": decoder, "start": start, "seed": seed}
-        model = _trained(study, kind, decoder, start, seed)
-        for row in study.compare({kind: model}):
+        file = _trained(study, kind, decoder, start, seed)
+        for row in study.measured_once(file, lambda: _read(file, kind, decoder, start)):
             rows.append(case | {key: row[key] for key in ("size", "scans", *FIGURES)})
     study.write("fair", rows)
     _draw(study, rows)
 
 
-def _trained(study: Study, kind: str, decoder: str, start: str, seed: int) -> models.Model:
-    name, size = DECODERS[decoder], _SIZE[decoder]
+def _trained(study: Study, kind: str, decoder: str, start: str, seed: int) -> Path:
+    name, size = _MODELS[decoder], _SIZE[decoder]
     rehearsed = None
     if kind == "values" and start == STARTS[1]:
         options = {**_TRAINING, "steps": REHEARSAL, "validations": 1}
@@ -149,8 +182,11 @@ def _trained(study: Study, kind: str, decoder: str, start: str, seed: int) -> mo
         rehearsed = study.trained(label, name, seed=seed, make=rehearsing(decoder), **options, **size)
     make = variant(kind, decoder, start, rehearsed)
     label = f"fair-{kind}-{decoder}-{start.replace(' ', '-')}-{seed}"
-    file = study.trained(label, name, seed=seed, make=make, **_TRAINING, **size)
-    model = make(**size)
+    return study.trained(label, name, seed=seed, make=make, **_TRAINING, **size)
+
+
+def _read(file: Path, kind: str, decoder: str, start: str) -> models.Model:
+    model = variant(kind, decoder, start)(**_SIZE[decoder])
     model.load_state_dict(models.load(file).state_dict())
     return model.eval()
 
@@ -187,10 +223,12 @@ def _draw(study: Study, rows: Sequence[Mapping[str, Any]]) -> None:
     found = by_case(rows, FAIR_KEYS)
     sizes = list(dict.fromkeys(size for *_, size in found))
     figure = Figure(figsize=(10, 3.2), layout="constrained")
-    cases = list(product(DECODERS, STARTS))
+    cases = list(product((*DECODERS, CONTROL), STARTS))
     for axis, size in zip(np.atleast_1d(figure.subplots(1, len(sizes), sharey=True)), sizes, strict=True):
         for number, kind in enumerate(KINDS):
             for at, (decoder, start) in enumerate(cases):
+                if (kind, decoder, start, size) not in found:
+                    continue
                 values = found[kind, decoder, start, size]["iou"]
                 where, label = at + 0.2 * (number - 1), kind if at == 0 else None
                 axis.plot([where, where], [min(values), max(values)], color=SERIES[number])

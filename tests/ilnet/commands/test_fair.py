@@ -5,12 +5,13 @@ import torch
 
 from ilnet import models
 from ilnet.commands import fair, study
-from ilnet.commands.fair import DECODERS, KINDS, STARTS, rehearsing, variant
+from ilnet.commands.fair import CONTROL, DECODERS, KINDS, STARTS, rehearsing, variant
 from ilnet.sensor import PAPER_INPUT
 from ilnet.world import simulate
 from ilnet.world.simulate import pose
 
-SMALL = {"MLP": {"features": 16, "blocks": 1, "hidden": 16}, "attention": {"features": 16, "blocks": 1}}
+SMALL = {name: {"features": 16, "blocks": 1} for name in ("attention", CONTROL)}
+SMALL["MLP"] = {"features": 16, "blocks": 1, "hidden": 16}
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +86,26 @@ def test_the_loss_is_that_of_the_answers_and_reaches_all_weights(asked):
         # The softmax does not depend on a bias that all four scores share.
         still = [name for name, weight in model.named_parameters() if weight.grad is None or not weight.grad.any()]
         assert all(name.endswith("bias") for name in still), (kind, decoder, still)
+
+
+def test_the_control_of_attention_has_all_but_attention(asked):
+    torch.manual_seed(0)
+    control = variant("weights", CONTROL, STARTS[0])(**SMALL[CONTROL])
+    torch.manual_seed(0)
+    whole = variant("weights", "attention", STARTS[0])(**SMALL["attention"])
+    with torch.no_grad():
+        whole.blocks[0].attention.out.weight.zero_()
+        whole.blocks[0].attention.out.bias.zero_()
+    torch.testing.assert_close(answers(control, asked), answers(whole, asked), rtol=0, atol=1e-2)
+
+
+def test_a_network_is_measured_once(tmp_path, monkeypatch):
+    file = tmp_path / "iln.safetensors"
+    compared = []
+    monkeypatch.setattr(study.Study, "compare", lambda self, files: compared.append(files) or [{"iou": 0.5}])
+    for scans in (1, 1, 2):  # other scans are measured anew
+        assert study.Study(None, tmp_path, scans).measured_once(file, lambda: "a network") == [{"iou": 0.5}]
+    assert len(compared) == 2
 
 
 def test_spread_has_means_and_spans():
