@@ -167,7 +167,7 @@ def fair(study: Study) -> None:
     for seed, (kind, decoder, start) in product(range(study.seeds), cases):
         case = {"kind": kind, "decoder": decoder, "start": start, "seed": seed}
         file = _trained(study, kind, decoder, start, seed)
-        for row in study.measured_once(file, lambda: _read(file, kind, decoder, start)):
+        for row in study.measured_once(file, _read(file, kind, decoder, start)):
             rows.append(case | {key: row[key] for key in ("size", "scans", *FIGURES)})
     study.write("fair", rows)
     _draw(study, rows)

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -106,12 +106,12 @@ class Study:
             rows += evaluate.measure(on_device, self.pairs(PAPER_INPUT.resize(*size)))
         return rows
 
-    def measured_once(self, file: Path, read: Callable[[], models.Model]) -> list[dict[str, Any]]:
+    def measured_once(self, file: Path, model: models.Model) -> list[dict[str, Any]]:
         """Returns the rows of `compare` for a trained network, and keeps them beside its weights for the next time."""
         kept = file.with_suffix(f".{self.scans}-scans.json")
         if not kept.exists():
             part = kept.with_suffix(".part")
-            part.write_text(json.dumps(self.compare({file.stem: read()})))
+            part.write_text(json.dumps(self.compare({file.stem: model})))
             part.replace(kept)
         return list(json.loads(kept.read_text()))
 
