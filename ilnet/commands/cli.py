@@ -517,7 +517,7 @@ def experiment(
     files = tuple(path for named in measured for path in scan_files.listed(named))
     study = Study(preset, out, scans, seeds, data, files)
     for name in chosen:
-        experiment.EXPERIMENTS[name](study)
+        study.run(name, experiment.EXPERIMENTS[name])
         click.echo(experiment.results(study))
 
 

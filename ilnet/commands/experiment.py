@@ -59,7 +59,9 @@ def table(study: Study) -> None:
             file = study.trained(f"lidar-sr-{size[0]}", "lidar-sr", archive=study.archive, target=size)
             lidar_sr = {"lidar-sr": file}
         methods[size] = rules | lidar_sr | networks
-        rows += study.compare(methods[size], [size])
+        for row in study.compare(methods[size], [size]):
+            card = models.card(methods[size][row["model"]])
+            rows.append(row | {key: card.get(key, "") for key in ("steps", "minutes")})
     study.write("table", rows)
     figure = Figure(figsize=(10, 3.2), layout="constrained")
     for axis, (name, paper) in zip(figure.subplots(1, len(study.sizes), sharey=True), PAPER.items(), strict=True):
@@ -251,13 +253,21 @@ def results(study: Study) -> Path:
     lines += _markdown(ratios(done))
     for name, rows in done.items():
         lines += ["", f"## {name}", "", inspect.getdoc(EXPERIMENTS[name]) or "", ""]
-        lines += [f"Made with {made[name]['networks']}.", "", f"![{name}]({name}.png)", ""]
+        lines += [f"Made with {made[name]['networks']}{_by(made[name])}.", "", f"![{name}]({name}.png)", ""]
         lines += _markdown(_shown(name, rows))
         if name == "table":
             lines += ["", *(f"![The same crop by every method, {town}](points-{town}.png)" for town in towns.TEST)]
     page = study.out / "RESULTS.md"
     page.write_text("\n".join(lines).rstrip() + "\n")
     return page
+
+
+def _by(about: Mapping[str, Any]) -> str:
+    """Returns by which command, at which commit and in how many minutes an experiment was made."""
+    if "command" not in about:
+        return ""
+    trained = f", after trainings of {about['training_minutes']}" if "training_minutes" in about else ""
+    return f", by `{about['command']}` at commit {about['commit']}, in {about['minutes']} minutes{trained}"
 
 
 def ratios(done: Mapping[str, Sequence[dict[str, Any]]]) -> list[dict[str, str]]:

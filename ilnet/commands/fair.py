@@ -164,11 +164,12 @@ def fair(study: Study) -> None:
     """
     rows = []
     cases = *product(KINDS, DECODERS, STARTS), *product(("weights",), (CONTROL,), STARTS)
-    for seed, (kind, decoder, start) in product(range(study.seeds), cases):
-        case = {"kind": kind, "decoder": decoder, "start": start, "seed": seed}
-        file = _trained(study, kind, decoder, start, seed)
-        for row in study.measured_once(file, _read(file, kind, decoder, start)):
-            rows.append(case | {key: row[key] for key in ("size", "scans", *FIGURES)})
+    for seed in range(study.seeds):
+        files = {case: _trained(study, *case, seed) for case in cases}
+        measured = study.measured_once({file: _read(file, *case) for case, file in files.items()})
+        for case, file in files.items():
+            named = dict(zip(FAIR_KEYS, case, strict=False)) | {"seed": seed}
+            rows += [named | {key: row[key] for key in ("size", "scans", *FIGURES)} for row in measured[file]]
     study.write("fair", rows)
     _draw(study, rows)
 

@@ -1,16 +1,18 @@
 """What experiments share: the networks that they train, the scans that they measure, and how they write and draw."""
 
 import csv
+import importlib.metadata
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import subprocess
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from matplotlib.figure import Figure
-from safetensors import safe_open
 
 from ilnet import models
 from ilnet.learning import evaluate, train
@@ -50,6 +52,7 @@ class Study:
         archive: Stored images, to compare with continuous rays and to train LiDAR-SR at those of `sizes` that it holds.
             If None, both are left out.
         measured: Files of measured scans. Their names without suffix differ, since results bear them.
+        used: Files of the networks that were trained for an experiment, in this run or before.
         sizes: Sizes that are predicted, those of the paper.
 
     Raises:
@@ -62,6 +65,7 @@ class Study:
     seeds: int = 3
     archive: Path | None = None
     measured: tuple[Path, ...] = ()
+    used: set[Path] = field(default_factory=set, init=False, repr=False)
     sizes: ClassVar[Sequence[tuple[int, int]]] = ((64, 1024), (128, 2048), (256, 4096))
 
     def __post_init__(self) -> None:
@@ -82,6 +86,7 @@ class Study:
         file = folder / f"{name}.safetensors"
         if not file.exists():
             train.train(name, self.preset or "small", folder, **options)
+        self.used.add(file)
         return file
 
     def followed(self, name: str, seed: int = 0) -> Path:
@@ -106,23 +111,16 @@ class Study:
             rows += evaluate.measure(on_device, self.pairs(PAPER_INPUT.resize(*size)))
         return rows
 
-    def measured_once(self, file: Path, model: models.Model) -> list[dict[str, Any]]:
-        """Returns the rows of `compare` for a trained network, and keeps them beside its weights for the next time."""
-        kept = file.with_suffix(f".{self.scans}-scans.json")
-        if not kept.exists():
-            part = kept.with_suffix(".part")
-            part.write_text(json.dumps(self.compare({file.stem: model})))
-            part.replace(kept)
-        return list(json.loads(kept.read_text()))
-
-    def _steps_of_lidar_sr(self) -> str:
-        files = {size[0]: self.out / "weights" / f"lidar-sr-{size[0]}" / "lidar-sr.safetensors" for size in self.sizes}
-        steps = []
-        for rows, file in files.items():
-            if file.exists():
-                with safe_open(file, "pt") as weights:
-                    steps.append(f"{weights.metadata()['steps']} steps for {rows} rows")
-        return ", ".join(steps)
+    def measured_once(self, networks: Mapping[Path, models.Model]) -> dict[Path, list[dict[str, Any]]]:
+        """Returns the rows of `compare` for networks by the files of their weights, beside which it keeps the rows."""
+        kept = {file: file.with_suffix(f".{self.scans}-scans.json") for file in networks}
+        missing = {str(file): model for file, model in networks.items() if not kept[file].exists()}
+        rows = self.compare(missing) if missing else []
+        for file in map(Path, missing):
+            part = file.with_suffix(".part")
+            part.write_text(json.dumps([row for row in rows if row["model"] == str(file)]))
+            part.replace(kept[file])
+        return {file: json.loads(kept[file].read_text()) for file in networks}
 
     def write(self, name: str, rows: Sequence[dict[str, Any]]) -> None:
         """Writes rows to NAME.csv, and to about.json what they were made with."""
@@ -131,15 +129,44 @@ class Study:
         trained = f"networks trained with preset {self.preset or 'small'}"
         networks = "the networks that ship" if shipped else trained
         if any(row.get("model") == "lidar-sr" for row in rows):
-            networks += f"; LiDAR-SR trained with preset {self.preset or 'small'}, {self._steps_of_lidar_sr()}"
-        about = made_with(self.out) | {name: {"networks": networks}}
-        (self.out / "about.json").write_text(json.dumps(about, indent=1) + "\n")
+            networks += f"; LiDAR-SR trained with preset {self.preset or 'small'}"
+        self._sign(name, {"networks": networks})
         with open(self.out / f"{name}.csv", "w", newline="") as file:
             writer = csv.DictWriter(file, rows[0], lineterminator="\n")
             writer.writeheader()
             writer.writerows(
                 {key: round(v, 4) if isinstance(v, float) else v for key, v in row.items()} for row in rows
             )
+
+    def run(self, name: str, experiment: Callable[["Study"], None]) -> None:
+        """Runs an experiment, and adds to about.json by which command, at which commit and in how many minutes."""
+        begun = time.monotonic()
+        self.used.clear()
+        experiment(self)
+        options = [f"--scans {self.scans}", f"--seeds {self.seeds}"]
+        options += [f"--preset {self.preset}"] if self.preset else []
+        options += ["--data DIR"] if self.archive else []
+        options += ["--measured FILE ..."] if self.measured else []
+        command = f"python -m ilnet experiment {name} {' '.join(options)}"
+        about = {"command": command, "commit": _commit(), "minutes": round((time.monotonic() - begun) / 60, 1)}
+        if self.used:
+            about["training_minutes"] = round(sum(models.card(file).get("minutes", 0) for file in self.used), 1)
+        self._sign(name, about)
+
+    def _sign(self, name: str, about: dict[str, Any]) -> None:
+        """Adds to about.json what an experiment was made with."""
+        made = made_with(self.out)
+        made[name] = made.get(name, {}) | about
+        (self.out / "about.json").write_text(json.dumps(made, indent=1) + "\n")
+
+
+def _commit() -> str:
+    """Returns the commit of this code or, where it is installed, its version."""
+    git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    try:
+        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return f"version {importlib.metadata.version('ilnet')}"
 
 
 def loaded(files: Mapping[str, str | Path | models.Model]) -> dict[str, models.Model]:

@@ -395,7 +395,8 @@ def _run(
         figures = _validate(trainer, training, scans)
     if trainer.is_global_zero:
         file = out / f"{plan.name}.safetensors"
-        models.save(training.model, file, plan.name, plan.arguments, **plan.run, held_out=figures)
+        card = plan.run | {"minutes": round((time.monotonic() - training.begun) / 60, 1), "held_out": figures}
+        models.save(training.model, file, plan.name, plan.arguments, **card)
         for checkpoint in folder.glob("*.ckpt"):
             checkpoint.unlink()
     return figures

@@ -30,6 +30,7 @@ __all__ = [
     "Planes",
     "Surfaces",
     "Upsampler",
+    "card",
     "create",
     "load",
     "returns",
@@ -128,6 +129,18 @@ def load(name: str | Path) -> Model:
         raise ValueError(f"{path}: not weights of {kind} with {arguments} ({error})") from error
     model.falling = falling
     return model.eval()
+
+
+def card(name: str | Path) -> dict[str, Any]:
+    """Returns how the weights of `load` were trained: their steps, minutes, preset and so on; empty for a rule.
+
+    Args:
+        name: One of `NAMES`, or a `.safetensors` file that `save` wrote.
+    """
+    if name in NAMES and name not in TRAINABLE:
+        return {}
+    with safe_open(_SHIPPED / f"{name}.safetensors" if name in NAMES else name, "pt") as file:
+        return {key: json.loads(value) for key, value in file.metadata().items()}
 
 
 def _fill(model: Model, state: dict[str, torch.Tensor]) -> None:

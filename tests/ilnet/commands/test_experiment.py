@@ -9,7 +9,7 @@ import torch
 
 from ilnet import data, models, scan_files
 from ilnet.commands import cli, evidence, experiment, fair, variants
-from ilnet.commands.study import Study, spans
+from ilnet.commands.study import Study, made_with, spans
 from ilnet.learning import evaluate, metrics, train
 from ilnet.sensor import PAPER_INPUT, preset
 from ilnet.world import simulate
@@ -136,7 +136,7 @@ def test_lidar_sr_has_a_network_for_each_size_that_is_stored(study, tmp_path, mo
 
     def fake(name, preset_name, folder, archive=None, target=None, **options):
         asked.append((folder.name, name, archive, target))
-        models.save(models.create("bilinear"), folder / f"{name}.safetensors", "bilinear", {}, steps=7)
+        models.save(models.create("bilinear"), folder / f"{name}.safetensors", "bilinear", {}, steps=7, minutes=1.5)
 
     monkeypatch.setattr(train, "train", fake)
     monkeypatch.setattr(Study, "sizes", ((32, 512), (64, 1024)))
@@ -144,9 +144,10 @@ def test_lidar_sr_has_a_network_for_each_size_that_is_stored(study, tmp_path, mo
     monkeypatch.setattr(experiment.plot, "point_clouds", lambda scans, path, reach: drawn.append(list(scans)))
     experiment.table(Study("tiny", study.out, 1, 1, archive=archive))
     assert asked[3:] == [("lidar-sr-64", "lidar-sr", archive, (64, 1024))]
-    assert [row["size"] for row in rows(study, "table") if row["model"] == "lidar-sr"] == ["64x1024"]
+    [row] = [row for row in rows(study, "table") if row["model"] == "lidar-sr"]
+    assert (row["size"], row["steps"], row["minutes"]) == ("64x1024", "7", "1.5")
     assert all("lidar-sr" in captions for captions in drawn)
-    assert "LiDAR-SR trained with preset tiny, 7 steps for 64 rows." in experiment.results(study).read_text()
+    assert "LiDAR-SR trained with preset tiny." in experiment.results(study).read_text()
 
 
 def test_every_part_of_surfaces_is_taken_away_once_and_beside_them_stands_an_oracle(study, monkeypatch):
@@ -279,12 +280,16 @@ def test_values_corrections_and_weights_are_compared_with_all_else_equal(study, 
     monkeypatch.setattr(fair, "REHEARSAL", 2)
     monkeypatch.setattr(fair, "_TRAINING", {**fair._TRAINING, "steps": 2})
     small = {"features": 16, "blocks": 1}
-    monkeypatch.setattr(fair, "_SIZE", {"MLP": {**small, "hidden": 16}, "attention": small})
+    monkeypatch.setattr(fair, "_SIZE", {"MLP": {**small, "hidden": 16}, "attention": small, fair.CONTROL: small})
     alone = Study(study.preset, study.out, scans=1, seeds=1)
-    fair.fair(alone)
+    alone.run("fair", fair.fair)
+    about = made_with(alone.out)["fair"]
+    assert about["command"] == "python -m ilnet experiment fair --scans 1 --seeds 1 --preset tiny"
+    assert len(about["commit"]) >= 7
+    assert about["training_minutes"] >= 0
     found = rows(alone, "fair")
     cases = {(row["kind"], row["decoder"], row["start"]) for row in found}
-    assert len(cases) == 3 * 2 * 2
+    assert len(cases) == 3 * 2 * 2 + 2
     assert len(found) == len(cases) * len(study.sizes)
     assert len({row["mae"] for row in found if row["size"] == "16x256"}) > 6
     assert (study.out / "fair.png").read_bytes()[:4] == b"\x89PNG"

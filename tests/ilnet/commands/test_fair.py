@@ -100,12 +100,16 @@ def test_the_control_of_attention_has_all_but_attention(asked):
 
 
 def test_a_network_is_measured_once(tmp_path, monkeypatch):
-    file = tmp_path / "iln.safetensors"
+    files = [tmp_path / f"{name}.safetensors" for name in ("one", "other")]
     compared = []
-    monkeypatch.setattr(study.Study, "compare", lambda self, files: compared.append(files) or [{"iou": 0.5}])
-    for scans in (1, 1, 2):  # other scans are measured anew
-        assert study.Study(None, tmp_path, scans).measured_once(file, "a network") == [{"iou": 0.5}]
-    assert len(compared) == 2
+    monkeypatch.setattr(
+        study.Study, "compare", lambda self, some: compared.append(len(some)) or [{"model": name} for name in some]
+    )
+    study.Study(None, tmp_path, 1).measured_once({files[0]: "a network"})
+    found = study.Study(None, tmp_path, 1).measured_once(dict.fromkeys(files, "a network"))
+    assert found == {file: [{"model": str(file)}] for file in files}
+    study.Study(None, tmp_path, 2).measured_once({files[0]: "a network"})  # other scans
+    assert compared == [1, 1, 1]
 
 
 def test_spread_has_means_and_spans():
