@@ -24,6 +24,7 @@ _EXPERIMENTS = (
     "sensors",
     "fair",
     "alignment",
+    "where",
     "all",
 )
 

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ilnet import data, models, scan_files
-from ilnet.commands import evidence, fair, plot
+from ilnet.commands import evidence, fair, plot, where
 from ilnet.commands.study import COLOURS, SERIES, Study, grouped_bars, loaded, made_with, spans
 from ilnet.learning import evaluate
 from ilnet.sensor import PAPER_INPUT, format_size
@@ -45,6 +45,9 @@ PAPER = {
         "iln": (1.763, 0.232, 0.353, 0.396, 0.373),
     },
 }
+
+# The networks whose training is followed, and how their curves are drawn.
+_CONVERGING = {"liif": "--", "iln": "-", "iln-surfaces": "-."}
 
 
 def table(study: Study) -> None:
@@ -90,20 +93,25 @@ def _draw_points(study: Study, size: tuple[int, int], files: Mapping[str, str | 
 def convergence(study: Study) -> None:
     """The paper's figure of convergence: test figures during training, over several seeds."""
     rows: list[dict[str, Any]] = []
-    for name in ("liif", "iln"):
+    for name in _CONVERGING:
         for seed in range(study.seeds):
             folder = study.followed(name, seed).parent
             rows += [{"model": name, "seed": seed, **row} for row in _probed(folder / name)]
     study.write("convergence", rows)
+    _draw_convergence(study, rows)
+
+
+def _draw_convergence(study: Study, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Draws IoU by step and by minute, and MAE by step: means over the seeds, and their spans."""
     figure = Figure(figsize=(10, 3.2), layout="constrained")
     for axis, (x, y) in zip(figure.subplots(1, 3), (("step", "iou"), ("seconds", "iou"), ("step", "mae")), strict=True):
-        for name in ("liif", "iln"):
+        for name, style in _CONVERGING.items():
             runs = [{r["step"]: r for r in rows if r["model"] == name and r["seed"] == s} for s in range(study.seeds)]
             steps = sorted(set.intersection(*(set(run) for run in runs)))
             values = np.array([[run[step][y] for step in steps] for run in runs])
             at = np.mean([[run[step][x] for step in steps] for run in runs], axis=0)
             at = at / 60 if x == "seconds" else at
-            axis.plot(at, values.mean(0), {"liif": "--", "iln": "-"}[name], color=COLOURS[name], label=name)
+            axis.plot(at, values.mean(0), style, color=COLOURS[name], label=name)
             axis.fill_between(at, values.min(0), values.max(0), color=COLOURS[name], alpha=0.25, linewidth=0)
         axis.set_xlabel({"step": "step", "seconds": "minutes"}[x])
         axis.set_ylabel({"iou": "IoU", "mae": "MAE [m]"}[y])
@@ -242,6 +250,7 @@ EXPERIMENTS: dict[str, Callable[[Study], None]] = {
     "sensors": evidence.sensors,
     "fair": fair.fair,
     "alignment": fair.alignment,
+    "where": where.where,
 }
 
 
@@ -255,6 +264,9 @@ def results(study: Study) -> Path:
         lines += ["", f"## {name}", "", inspect.getdoc(EXPERIMENTS[name]) or "", ""]
         lines += [f"Made with {made[name]['networks']}{_by(made[name])}.", "", f"![{name}]({name}.png)", ""]
         lines += _markdown(_shown(name, rows))
+        for part in (part for part in made if part.startswith(f"{name}-")):
+            lines += ["", f"### {part}", "", f"![{part}]({part}.png)", ""]
+            lines += _markdown(_read(study.out / f"{part}.csv"))
         if name == "table":
             lines += ["", *(f"![The same crop by every method, {town}](points-{town}.png)" for town in towns.TEST)]
     page = study.out / "RESULTS.md"

@@ -23,7 +23,7 @@ from ilnet.world import simulate, towns
 __all__ = ["COLOURS", "FIGURES", "SERIES", "Study", "by_case", "grouped_bars", "loaded", "made_with", "spans"]
 
 # Experiments that compare the networks that ship, unless a preset is given to train others.
-_SHIPPED = "table", "real", "confidence", "sensors", "alignment"
+_SHIPPED = "table", "real", "confidence", "sensors", "alignment", "where"
 
 FIGURES = {"iou": "IoU", "mae": "MAE [m]", "floating": "floating"}
 """The figures that are compared over several seeds, and what they are called."""
@@ -90,8 +90,11 @@ class Study:
         return file
 
     def followed(self, name: str, seed: int = 0) -> Path:
-        """Returns the same for a network with the preset's own arguments, and logs test figures during training."""
-        return self.trained(f"{name}-{seed}", name, seed=seed, probe=self.probe)
+        """Returns the same for a network with the preset's own arguments, and logs test figures during training.
+
+        It learns from the paper's input sensor, by which it is tested.
+        """
+        return self.trained(f"{name}-{seed}", name, seed=seed, sensors=[PAPER_INPUT], probe=self.probe)
 
     def networks(self) -> dict[str, str | Path]:
         """Returns the networks that are compared with other methods."""
@@ -123,9 +126,14 @@ class Study:
         return {file: json.loads(kept[file].read_text()) for file in networks}
 
     def write(self, name: str, rows: Sequence[dict[str, Any]]) -> None:
-        """Writes rows to NAME.csv, and to about.json what they were made with."""
+        """Writes rows to NAME.csv, and to about.json what they were made with.
+
+        Args:
+            name: That of the experiment, or of a part of it: EXPERIMENT-PART.
+            rows: At least one, all with the same keys.
+        """
         self.out.mkdir(parents=True, exist_ok=True)
-        shipped = self.preset is None and name in _SHIPPED
+        shipped = self.preset is None and name.partition("-")[0] in _SHIPPED
         trained = f"networks trained with preset {self.preset or 'small'}"
         networks = "the networks that ship" if shipped else trained
         if any(row.get("model") == "lidar-sr" for row in rows):

@@ -19,7 +19,7 @@ from ilnet.sensor import PAPER_INPUT, Sensor
 from kernels import reference, surface_hypotheses
 from kernels.checks import KINDS
 
-__all__ = ["SIZE", "VARIANTS", "Blended", "blended", "ceilings", "from_one_channel", "from_ranges"]
+__all__ = ["SIZE", "VARIANTS", "Blended", "blended", "ceilings", "from_one_channel", "from_ranges", "surface_weights"]
 
 SIZE = {"features": 24, "blocks": 4, "tokens": 16, "heads": 4}
 """Arguments of the small networks that are compared."""
@@ -34,6 +34,17 @@ def _hypotheses(image: torch.Tensor, queries: torch.Tensor, sensor: Sensor, wrap
     return found.where(found > 0, sensor.norm_range)
 
 
+def surface_weights(scores: torch.Tensor, queries: torch.Tensor) -> torch.Tensor:
+    """Returns the weights (B, Q, 36) of the hypotheses: `kernels.surfaces.maths`, Eq. (3).
+
+    Args:
+        scores: (B, Q, 4, 9), see `Surfaces.scores`.
+        queries: (B, Q, 2) pixel coordinates (row, column).
+    """
+    prior = reference.surface_areas(queries).log().unsqueeze(-1)
+    return (scores + prior).flatten(-2).softmax(-1)
+
+
 class Blended(models.Surfaces):
     """The same network, answered with the weighted mean of the hypotheses and trained by its L1, as in the paper."""
 
@@ -46,8 +57,7 @@ class Blended(models.Surfaces):
     def decode(self, encoded: Any, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         """Returns the weighted means (B, Q) [m]."""
         scores, _ = self.scores(encoded, queries, wrap)
-        prior = reference.surface_areas(queries).log().unsqueeze(-1)
-        weights = (scores + prior).flatten(-2).softmax(-1)
+        weights = surface_weights(scores, queries)
         return (weights * _hypotheses(image, queries, encoded.sensor, wrap).flatten(-2)).sum(-1)
 
     def loss(

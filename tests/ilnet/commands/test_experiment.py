@@ -72,7 +72,7 @@ def test_convergence_follows_test_figures_over_seeds(study):
     experiment.convergence(study)
     found = rows(study, "convergence")
     assert {(row["model"], row["seed"], row["step"]) for row in found} == {
-        (name, seed, step) for name in ("liif", "iln") for seed in "01" for step in "24"
+        (name, seed, step) for name in ("liif", "iln", "iln-surfaces") for seed in "01" for step in "24"
     }
     assert all(float(row["seconds"]) > 0 for row in found)
     page = experiment.results(study).read_text()
