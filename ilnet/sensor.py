@@ -5,20 +5,25 @@ counter-clockwise from +x (left is +90 deg), elevation rises from the horizontal
 
     x = cos(elevation) cos(azimuth),  y = cos(elevation) sin(azimuth),  z = sin(elevation)
 
-Python code holds radians and metres. Degrees appear only in files and in the presets below.
+Python code holds radians and metres. Degrees appear only in files and in `ilnet.sensors`, the tables of the presets.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
+
+from ilnet.sensors import TABLES, Table
+from ilnet.sensors.table import FALLING, RISING
 
 __all__ = [
     "PAPER_INPUT",
     "PAPER_TARGET",
     "PRESETS",
+    "SOURCES",
     "Sensor",
     "angles_to_directions",
     "directions_to_angles",
@@ -26,6 +31,10 @@ __all__ = [
     "parse_size",
     "preset",
 ]
+
+
+# Of a turn, in a table that only names their number.
+_MOST_COLUMNS = 1 << 16
 
 
 def angles_to_directions(elevation: torch.Tensor, azimuth: torch.Tensor) -> torch.Tensor:
@@ -136,6 +145,52 @@ class Sensor:
             f"Sensor({self.name or 'unnamed'}, {self.size}, elevations {e[0]:.2f}..{e[-1]:.2f} deg, "
             f"azimuths {a[0]:.2f}..{a[-1]:.2f} deg, {self.min_range:g}..{self.max_range:g} m)"
         )
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> "Sensor":
+        """Returns the sensor that a table in degrees and metres describes, as files hold it.
+
+        Args:
+            table: `elevation_deg` (H,) of the rows; `column_azimuth_deg` (W,) of the columns, or `columns`, their
+                number in an even full turn that falls from 180°. Optional are `min_range`, `max_range`, `norm_range`
+                [m] and `name`. Other keys are ignored.
+
+        Raises:
+            ValueError: If it lacks an angle, breaks a rule of `Sensor`, or holds radians.
+        """
+        missing = [key for key in ("elevation_deg", "column_azimuth_deg") if table.get(key) is None]
+        columns = table.get("columns")
+        if missing == ["column_azimuth_deg"] and columns is not None:
+            if not (isinstance(columns, int) and 2 <= columns <= _MOST_COLUMNS):
+                raise ValueError(f"columns is {columns!r}; it should be a whole number from 2 to {_MOST_COLUMNS}")
+            azimuths = _even_turn(columns, FALLING)
+        elif missing:
+            raise ValueError(f"it lacks {', '.join(missing)}: the angles of the rows and of the columns [deg]")
+        else:
+            azimuths = _table("column_azimuth_deg", table["column_azimuth_deg"])
+        elevations = _table("elevation_deg", table["elevation_deg"])
+        for name, angles, most in (
+            ("elevation_deg", elevations, math.pi / 2),
+            ("column_azimuth_deg", azimuths, math.tau),
+        ):
+            if _looks_like_radians(angles, most):
+                raise ValueError(
+                    f"{name} spans {np.ptp(angles):.3g} deg with {len(angles)} entries; it should hold degrees: "
+                    "are these radians?"
+                )
+        limits = {key: table[key] for key in ("min_range", "max_range", "norm_range", "name") if key in table}
+        return cls(np.deg2rad(elevations), np.deg2rad(azimuths), **limits)
+
+    def table(self) -> dict[str, Any]:
+        """Returns the sensor as `from_table` takes it: degrees and metres, in lists and numbers."""
+        return {
+            "name": self.name,
+            "elevation_deg": np.rad2deg(self.elevations).round(6).tolist(),
+            "column_azimuth_deg": np.rad2deg(self.azimuths).round(6).tolist(),
+            "min_range": self.min_range,
+            "max_range": self.max_range,
+            "norm_range": self.norm_range,
+        }
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -312,7 +367,7 @@ def _table(name: str, value: object) -> np.ndarray:
         value = value.detach().cpu().numpy()
     try:
         table = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{name} is of type {type(value).__name__}; it should be a list of angles [rad]") from None
     if table.ndim != 1:
         raise ValueError(f"{name} has shape {table.shape}; it should be a list of angles [rad]")
@@ -325,8 +380,8 @@ def _table(name: str, value: object) -> np.ndarray:
 def _limit(name: str, value: object) -> float:
     try:
         limit = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} is {value!r}; it should be a number of metres") from None
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{name} is {value!r:.40}; it should be a number of metres") from None
     if not math.isfinite(limit):
         raise ValueError(f"{name} is {limit}; it should be finite")
     return limit
@@ -335,6 +390,20 @@ def _limit(name: str, value: object) -> float:
 def _is_monotonic(table: np.ndarray) -> bool:
     steps = np.diff(table)
     return bool((steps > 0).all() or (steps < 0).all())
+
+
+def _looks_like_radians(angles: np.ndarray, most: float) -> bool:
+    """Returns whether angles said to be degrees are within `most` [rad] and closer than any sensor's: radians are.
+
+    No sensor has rows 0.1° apart over less than 3°, nor columns less than 0.02° apart over less than 7°; a full turn of
+    few columns is one of about 2 pi.
+    """
+    if len(angles) < 2 or not np.abs(angles).max() <= most * 1.01:
+        return False
+    steps = np.abs(np.diff(angles))
+    step = float(np.median(steps))
+    turn = most > math.pi and abs(float(np.ptp(angles)) + step - math.tau) < 0.01 + 0.1 * step
+    return turn or step < (0.1 if most < math.pi else 0.02)
 
 
 def _fractional_index(table: np.ndarray, value: torch.Tensor) -> torch.Tensor:
@@ -347,48 +416,25 @@ def _fractional_index(table: np.ndarray, value: torch.Tensor) -> torch.Tensor:
     return lower + (value - start) / (end - start)
 
 
-def _from_degrees(
-    name: str, elevations: np.ndarray, azimuths: np.ndarray, limits: tuple[float, float, float]
-) -> Sensor:
-    return Sensor(np.deg2rad(elevations), np.deg2rad(azimuths), *limits, name=name)
-
-
-def _turn(columns: int, first: float) -> np.ndarray:
+def _even_turn(columns: int, first: float) -> np.ndarray:
     """Returns an even full turn [deg] from `first`, -180 or 180, so that forward is the middle of the image."""
     return np.linspace(first, -first, columns, endpoint=False)
 
 
-# Azimuth of the first column [deg], where azimuths rise or fall from column to column.
-_RISING, _FALLING = -180.0, 180.0
+def _preset(name: str, table: Table) -> Sensor:
+    azimuths = _even_turn(table.columns, table.first)
+    return Sensor(np.deg2rad(table.elevations), np.deg2rad(azimuths), *table.limits, name=name)
 
-PRESETS: dict[str, Sensor] = {
-    sensor.name: sensor
-    for sensor in (
-        # The paper's simulated sensors (row 0 lowest).
-        *(
-            _from_degrees(f"paper-{h}x{w}", np.linspace(-15, 15, h), _turn(w, _RISING), (2, 80, 100))
-            for h, w in ((16, 1024), (64, 1024), (128, 2048), (256, 4096))
-        ),
-        # Velodyne: VLP-16 at 10 Hz; HDL-64E (KITTI), whose upper beams are 1/3 and lower ones 1/2 degree apart.
-        _from_degrees("vlp-16", np.arange(-15, 16, 2), _turn(1800, _RISING), (0.5, 100, 120)),
-        _from_degrees(
-            "hdl-64e",
-            np.concatenate((2 - np.arange(32) / 3, -8 - 5 / 6 - np.arange(32) / 2)),
-            _turn(2048, _FALLING),
-            (0.9, 120, 150),
-        ),
-        # Ouster's nominal fields of view. The metadata of a real unit has its own table, often a degree narrower.
-        *(
-            _from_degrees(f"{model}-{h}", np.linspace(half, -half, h), _turn(w, _FALLING), limits)
-            for model, half, w, limits, beams in (
-                ("os0", 45.0, 1024, (0.5, 100, 120), (32, 128)),
-                ("os1", 22.5, 1024, (0.5, 200, 250), (32, 64, 128)),
-                ("os2", 11.25, 2048, (1.0, 400, 500), (128,)),
-            )
-            for h in beams
-        ),
-    )
+
+# The paper's simulated sensors (row 0 lowest).
+_PAPER = {
+    f"paper-{h}x{w}": Table(np.linspace(-15, 15, h), w, (2, 80, 100), "Implicit LiDAR Network, ICRA 2022", RISING)
+    for h, w in ((16, 1024), (64, 1024), (128, 2048), (256, 4096))
 }
+
+PRESETS: dict[str, Sensor] = {name: _preset(name, table) for name, table in (_PAPER | TABLES).items()}
+SOURCES: dict[str, str] = {name: table.source for name, table in (_PAPER | TABLES).items()}
+"""Where the numbers of each preset stand."""
 
 
 def preset(name: str) -> Sensor:

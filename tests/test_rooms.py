@@ -17,7 +17,9 @@ FLOORS = [
     {"ilnet.models", "ilnet.world"},
     {"ilnet.scan_files"},
     {"ilnet.scan"},
+    {"ilnet.sensor_files"},
     {"ilnet.sensor"},
+    {"ilnet.sensors"},
     {"kernels"},
 ]
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}

@@ -60,7 +60,9 @@ def cli(context: click.Context) -> None:
 @click.option("--at", type=(float, float, float), metavar="X Y Z", help="Position of the sensor in the mesh [m].")
 @click.option("--scan", type=Path, metavar="FILE", help="Keep some beams of this scan; predict all.")
 @click.option("--rows", type=int, metavar="N", help="Beams of the scan to keep; 16 by default.")
-@click.option("--sensor", metavar="NAME", help="Preset with the scan's angles, if the file does not hold them.")
+@click.option(
+    "--sensor", metavar="NAME|FILE", help="Preset or table with the scan's angles, if the file does not hold them."
+)
 @click.option("--out", type=Path, default=Path("demo_output"), show_default=True, help="Folder for the pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the table.")
 def demo(
@@ -108,7 +110,8 @@ def demo(
 @click.option(
     "--sensors",
     metavar="any|NAMES",
-    help="Input sensors of the rays: presets, comma separated, or any. The paper's by default; any for iln-surfaces.",
+    help="Input sensors of the rays: presets or tables, comma separated, or any. The paper's by default; any for "
+    "iln-surfaces.",
 )
 @click.option("--out", type=Path, default=Path("runs"), show_default=True, help="Folder for weights, figures, logs.")
 def train(
@@ -125,7 +128,7 @@ def train(
 
     `torchrun --nproc-per-node N -m ilnet train MODEL` shares each batch among N processes or GPUs.
     """
-    from ilnet import sensor
+    from ilnet import sensor_files
     from ilnet.learning import train
     from ilnet.sensor import PAPER_INPUT, PAPER_TARGET
 
@@ -140,7 +143,7 @@ def train(
         )
     wanted = None
     if sensors:
-        wanted = [] if sensors == "any" else [sensor.preset(name) for name in sensors.split(",")]
+        wanted = [] if sensors == "any" else [sensor_files.named(name) for name in sensors.split(",")]
     figures = train.train(model, preset, out, steps, seed, data, size or PAPER_TARGET.shape, wanted)
     click.echo(f"{out / model}.safetensors: " + ", ".join(f"{name} {value:.3f}" for name, value in figures.items()))
 
@@ -161,7 +164,9 @@ def train(
     help="Keep some beams of this scan, or of each in a folder; predict all. May be repeated.",
 )
 @click.option("--rows", type=int, metavar="N", help="Beams of the scan to keep; 16 by default.")
-@click.option("--sensor", metavar="NAME", help="Preset with the scan's angles, if the file does not hold them.")
+@click.option(
+    "--sensor", metavar="NAME|FILE", help="Preset or table with the scan's angles, if the file does not hold them."
+)
 @click.option("--size", type=_Size(), help="Rays to predict in the scene; 128x2048 by default.")
 @click.option(
     "--scans",
@@ -288,9 +293,14 @@ def _json(value: Any) -> str:
 @click.argument("source", metavar="IN", type=Path)
 @click.argument("out", metavar="OUT", type=Path)
 @click.option("--size", type=_Size(), help="Rays to predict, over the same field of view.")
-@click.option("--sensor", metavar="NAME", help="Preset to predict, instead of --size.")
+@click.option("--sensor", metavar="NAME|FILE", help="Preset or table to predict, instead of --size.")
 @click.option("--model", "name", default="iln-surfaces", show_default=True, metavar="NAME|FILE")
-@click.option("--from", "origin", metavar="NAME", help="Preset with the angles of IN, if its files do not hold them.")
+@click.option(
+    "--from",
+    "origin",
+    metavar="NAME|FILE",
+    help="Preset or table with the angles of IN, if its files do not hold them.",
+)
 @click.option(
     "--format",
     "suffix",
@@ -320,12 +330,11 @@ def upsample(
         raise click.UsageError("give --size ROWSxCOLUMNS or --sensor NAME")
     if suffix and not source.is_dir():
         raise click.UsageError("--format goes with a folder; the suffix of OUT says the format of one file")
-    from ilnet import models
+    from ilnet import models, sensor_files
     from ilnet.commands import upsample
-    from ilnet.sensor import preset
 
-    target = size or preset(str(sensor))
-    sensors = target, preset(origin) if origin else None
+    target = size or sensor_files.named(str(sensor))
+    sensors = target, sensor_files.named(origin) if origin else None
     model, ending = models.load(name), f".{suffix or 'npz'}"
     written, failed = upsample.run(source, out, model, *sensors, ending, min_confidence)
     if written:
@@ -342,7 +351,7 @@ def upsample(
 @click.option("--at", type=Path, metavar="JSON", help='Sensor positions in the mesh [m]: {"positions": [[x, y, z]]}.')
 @click.option("--scans", type=click.IntRange(min=1), required=True, metavar="N", help="Poses to scan from, in total.")
 @click.option("--sizes", metavar="HxW", help=f"Sizes of the paper's sensor, comma separated; {_SIZES} by default.")
-@click.option("--sensor", metavar="NAMES", help="Presets, comma separated, instead of --sizes.")
+@click.option("--sensor", metavar="NAMES", help="Presets or tables, comma separated, instead of --sizes.")
 @click.option(
     "--effect",
     "effects",
@@ -384,16 +393,16 @@ def simulate(
     part, _, parts = shard.partition("/")
     if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
         raise click.UsageError(f"--shard is {shard!r}; it should be I/N with 1 <= I <= N, such as 2/3")
+    from ilnet import sensor_files
     from ilnet.commands import options
     from ilnet.data import generate
-    from ilnet.sensor import preset
     from ilnet.world.towns import NAMES
 
     if mesh and at:
         places = generate.mesh_place(mesh, at)
     else:
         places = generate.town_places(options.towns(towns or ",".join(NAMES)))
-    sensors = [preset(name) for name in sensor.split(",")] if sensor else options.sensors(sizes or _SIZES)
+    sensors = [sensor_files.named(name) for name in sensor.split(",")] if sensor else options.sensors(sizes or _SIZES)
     wanted = options.effects(effects)
     try:
         archive = generate.generate(out, places, scans, sensors, seed, (int(part), int(parts)), workers, wanted)

@@ -12,10 +12,10 @@ import numpy as np
 from scipy import stats
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from ilnet import models, scan_files
+from ilnet import models, scan_files, sensor_files
 from ilnet.learning import metrics
 from ilnet.scan import Pair
-from ilnet.sensor import PAPER_INPUT, Sensor, preset
+from ilnet.sensor import PAPER_INPUT, Sensor
 from ilnet.world import places, simulate
 
 __all__ = ["interval", "measure", "mesh_pairs", "scan_by_scan", "scan_pair", "summary", "town_pairs"]
@@ -79,13 +79,13 @@ def scan_pair(path: Path, rows: int, sensor: str | None = None) -> Pair:
     Args:
         path: A scan file; see `ilnet.scan_files.read`.
         rows: Number of beams to keep, fewer than the scan has.
-        sensor: Name of the preset with the file's angles, where the file does not hold them.
+        sensor: Name of the preset or file of a table with the file's angles, where the file does not hold them.
 
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If it is not a scan, or cannot be decimated so.
     """
-    truth = scan_files.read(path, preset(sensor) if sensor else None).to(simulate.best_device())
+    truth = scan_files.read(path, sensor_files.named(sensor) if sensor else None).to(simulate.best_device())
     scan = truth.decimate(rows)
     if rows == truth.sensor.shape[0]:
         raise ValueError(f"rows is {rows}, all the beams of {path}; keep fewer, so that there are some to predict")

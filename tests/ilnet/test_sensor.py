@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from ilnet.sensor import (
     PRESETS,
+    SOURCES,
     Sensor,
     angles_to_directions,
     directions_to_angles,
@@ -200,7 +201,7 @@ def test_locate_by_hand_across_the_seam():
     torch.testing.assert_close(sensor.locate(*angles.T), torch.tensor(list(cases.values())), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("turns", [0, 1, -1, 7])
+@pytest.mark.parametrize("turns", [0, 7])
 @pytest.mark.parametrize("name", PRESETS)
 def test_table_entries_are_integers(name, turns):
     sensor = preset(name)
@@ -378,6 +379,20 @@ def test_resize_partial_circle():
         ("os1-64", (64, 1024), 22.5, -22.5, "top", -360 / 1024),
         ("os1-128", (128, 1024), 22.5, -22.5, "top", -360 / 1024),
         ("os2-128", (128, 2048), 11.25, -11.25, "top", -360 / 2048),
+        ("hdl-32e", (32, 2170), 10.67, -30.67, "top", -360 / 2170),
+        ("vlp-32c", (32, 1800), 15, -25, "top", -0.2),
+        ("vls-128", (128, 1800), 15, -25, "top", -0.2),
+        ("os0-64", (64, 1024), 45, -45, "top", -360 / 1024),
+        ("os2-32", (32, 2048), 11.25, -11.25, "top", -360 / 2048),
+        ("os2-64", (64, 2048), 11.25, -11.25, "top", -360 / 2048),
+        ("os1-32-gradient", (32, 1024), 12.75, -15.32, "top", -360 / 1024),
+        ("pandar40p", (40, 1800), 15, -25, "top", -0.2),
+        ("pandar64", (64, 1800), 15, -25, "top", -0.2),
+        ("xt32", (32, 2000), 15, -16, "top", -0.18),
+        ("qt64", (64, 600), 52.133, -52.121, "top", -0.6),
+        ("ot128", (128, 1800), 15.139, -24.71, "top", -0.2),
+        ("rs-helios-5515", (32, 1800), 15, -55, "top", -0.2),
+        ("rs-ruby-plus", (128, 1800), 15.03, -25.05, "top", -0.2),
     ],
 )
 def test_preset(name, shape, top, bottom, row_0, column_step):
@@ -393,13 +408,77 @@ def test_preset(name, shape, top, bottom, row_0, column_step):
     assert sensor.azimuths[shape[1] // 2] == pytest.approx(0, abs=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("name", "finest"),
+    [
+        ("hdl-32e", 1.33),
+        ("vlp-32c", 0.333),
+        ("vls-128", 0.11),
+        ("os1-32-gradient", 0.33),
+        ("pandar40p", 1 / 3),
+        ("pandar64", 1 / 6),
+        ("xt32", 1.0),
+        ("qt64", 1.45),
+        ("rs-ruby-plus", 0.09),
+    ],
+)
+def test_the_finest_spacing_of_a_preset_is_that_of_its_data_sheet(name, finest):
+    assert np.abs(np.diff(np.rad2deg(preset(name).elevations))).min() == pytest.approx(finest, abs=2e-3)
+
+
 def test_preset_details():
     assert set(PRESETS) == {preset(name).name for name in PRESETS}
+    assert set(SOURCES) == set(PRESETS)
+    assert all(SOURCES.values())
     paper = preset("paper-16x1024")
     assert (paper.min_range, paper.max_range, paper.norm_range) == (2, 80, 100)
     np.testing.assert_allclose(np.rad2deg(preset("vlp-16").elevations), np.arange(-15, 16, 2))
     rows = np.rad2deg(preset("hdl-64e").elevations)
     np.testing.assert_allclose(rows[[0, 1, 31, 32, 33, 63]], [2, 1.667, -8.333, -8.833, -9.333, -24.333], atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["paper-16x1024", "vls-128", "os1-32-gradient"])
+def test_a_table_in_degrees_gives_the_sensor_back(name):
+    sensor = preset(name)
+    table = sensor.table()
+    assert Sensor.from_table(table) == Sensor.from_table(
+        {**table, "column_azimuth_deg": np.array(table["column_azimuth_deg"])}
+    )
+    np.testing.assert_allclose(Sensor.from_table(table).elevations, sensor.elevations, atol=1e-8)
+    np.testing.assert_allclose(Sensor.from_table(table).azimuths, sensor.azimuths, atol=1e-8)
+    assert Sensor.from_table(table).max_range == sensor.max_range
+
+
+def test_a_table_may_name_the_number_of_even_columns():
+    sensor = Sensor.from_table({"elevation_deg": [1, -1], "columns": 1024, "min_range": 1, "source": "ignored"})
+    np.testing.assert_allclose(sensor.azimuths, preset("os1-128").azimuths, atol=1e-12)
+    assert (sensor.min_range, sensor.max_range) == (1, 80)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"elevation_deg": None}, "it lacks elevation_deg"),
+        ({"column_azimuth_deg": None}, "it lacks column_azimuth_deg"),
+        ({"column_azimuth_deg": None, "columns": 10**9}, "columns is 1000000000; it should be .* from 2 to 65536"),
+        ({"column_azimuth_deg": None, "columns": 8.5}, "columns is 8.5"),
+        ({"elevation_deg": [10**400, 1]}, "elevation_deg is of type list"),
+        ({"max_range": 10**400}, "max_range is 1000.*it should be a number of metres"),
+        ({"elevation_deg": np.deg2rad(np.linspace(22.5, -22.5, 64))}, "elevation_deg spans 0.785 deg.*radians"),
+        ({"column_azimuth_deg": np.deg2rad(np.arange(360.0))}, "column_azimuth_deg spans 6.27 deg.*radians"),
+        ({"column_azimuth_deg": np.deg2rad(np.arange(0, 360, 22.5))}, "column_azimuth_deg spans 5.89 deg.*radians"),
+        ({"column_azimuth_deg": np.deg2rad(np.arange(0, 90, 0.2))}, "column_azimuth_deg spans 1.57 deg.*radians"),
+    ],
+)
+def test_what_is_no_table(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Sensor.from_table({**preset("vlp-16").table(), **changes})
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_no_preset_is_taken_for_radians(name):
+    Sensor.from_table(preset(name).table())
+    Sensor.from_table(preset(name).resize(512, 8192).table())
 
 
 def test_unknown_preset():
