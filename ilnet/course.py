@@ -1,20 +1,39 @@
-"""What the notebooks share: checks of exercises, sliders, 3-D scenes, drawings of threads. Needs the extra `course`."""
+"""What the notebooks share: checks of exercises, sliders, 3-D scenes, traces of threads. Needs the extra `course`."""
 
+import inspect
 import io
+import math
 import os
 from collections.abc import Callable, Sequence
+from functools import wraps
 from html import escape
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import ipywidgets
+import numpy as np
 import PIL.Image
+import torch
+import warp as wp
 from IPython.display import HTML, Image
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 
-__all__ = ["Cells", "check", "draw_thread", "show_scene", "slide"]
+__all__ = [
+    "Cells",
+    "Trace",
+    "check",
+    "draw_thread",
+    "draw_trace",
+    "run",
+    "show_scene",
+    "slide",
+    "trace_thread",
+    "yours_or",
+]
 
+_NOT_YET = "Not answered yet: replace the line that raises NotImplementedError, and run both cells again."
 # Inches: the width of a drawing, and the side of an array element in it.
 _WIDTH, _CELL = 9.0, 0.17
 
@@ -36,7 +55,7 @@ def check(checks: Callable[[], object]) -> None:
     except NotImplementedError as error:
         if error.args:
             raise
-        print("Not answered yet: replace the line that raises NotImplementedError, and run both cells again.")
+        print(_NOT_YET)
     else:
         print("Right.")
 
@@ -58,6 +77,49 @@ def slide(draw: Callable[..., object], **values: tuple[float, float, float]) -> 
 
 def _somebody_is_there() -> bool:
     return "JPY_SESSION_NAME" in os.environ or "VSCODE_PID" in os.environ
+
+
+def yours_or(given: Callable[..., Any], answer: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns the answer to an exercise, with a stand-in that serves for as long as the exercise is not answered.
+
+    Args:
+        given: What serves until then.
+        answer: The learner's function. It raises a bare NotImplementedError as long as it is not answered.
+
+    Returns:
+        A function that calls `answer`, or else `given`.
+    """
+
+    @wraps(given)
+    def function(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return answer(*args, **kwargs)
+        except NotImplementedError as error:
+            if error.args:
+                raise
+            return given(*args, **kwargs)
+
+    return function
+
+
+def run(kernel: wp.Kernel, threads: int | tuple[int, ...], inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+    """Launches a Warp kernel on torch tensors, without a copy, on their device and its current stream.
+
+    Args:
+        kernel: The kernel.
+        threads: How many threads it has, or their numbers along each axis.
+        inputs: Its first arguments: tensors, whose dtype the kernel may leave open, and numbers.
+        outputs: Its other arguments, tensors that it writes to.
+
+    Raises:
+        NotImplementedError: If the kernel is an exercise that is not answered yet.
+    """
+    if "NotImplementedError" in kernel.func.__code__.co_names:
+        raise NotImplementedError
+    device = outputs[0].device
+    stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None
+    arrays = [[wp.from_torch(x.detach()) if torch.is_tensor(x) else x for x in part] for part in (inputs, outputs)]
+    wp.launch(kernel, threads, *arrays, device=str(device), stream=stream)
 
 
 def show_scene(plotter: Any) -> HTML | Image:
@@ -93,6 +155,170 @@ class Cells(NamedTuple):
     """How many rows and columns to draw."""
     touched: Sequence[tuple[int, int]]
     """The (row, column) of each element that the thread reads or writes."""
+
+
+class Trace(NamedTuple):
+    """What one thread of a kernel touches. `draw_thread` draws it."""
+
+    reads: list[Cells]
+    """The arrays of which it reads elements."""
+    writes: list[Cells]
+    """The arrays of which it writes elements. "+=" after a name: it adds to them, atomically."""
+    bytes: int
+    """How many bytes it moves if it reads and writes each element once; adding takes both."""
+
+
+def trace_thread(kernel: wp.Kernel, thread: int | tuple[int, ...], arguments: Sequence[Any]) -> Trace:
+    """Replays one thread of a kernel in Python and records which elements of its arrays it touches.
+
+    A kernel is a Python function, so it runs here as it stands, on copies of its arguments and with another `wp`. Real
+    numbers become Python's. Integers divide as in Python, so a kernel that divides negative ones may go elsewhere.
+
+    Args:
+        kernel: The kernel, with the functions that it calls.
+        thread: What `wp.tid()` returns.
+        arguments: All arguments of a launch, its inputs and then its outputs: tensors and numbers. Keep them small.
+
+    Returns:
+        The elements it reads, in the order of the arguments, and those it writes.
+
+    Raises:
+        IndexError: If the thread touches an element that an array does not have.
+    """
+    names = inspect.signature(kernel.func).parameters
+    recorded = [
+        _Recorded(name, x.detach().cpu().numpy()) if torch.is_tensor(x) else x
+        for name, x in zip(names, arguments, strict=True)
+    ]
+    _in_python(kernel.func, _WarpInPython(thread))(*recorded)
+    arrays = [x for x in recorded if isinstance(x, _Recorded)]
+    reads = [x.cells(x.read) for x in arrays if x.read]
+    writes = [x.cells(x.written) for x in arrays if x.written] + [x.cells(x.added, " +=") for x in arrays if x.added]
+    moved = sum((len(x.read) + len(x.written) + 2 * len(x.added)) * x.values.itemsize for x in arrays)
+    return Trace(reads, writes, moved)
+
+
+def draw_trace(kernel: wp.Kernel, thread: int | tuple[int, ...], arguments: Sequence[Any], steps: str) -> Image | None:
+    """Draws what one thread of a kernel touches, see `trace_thread`.
+
+    Args:
+        kernel: The kernel.
+        thread: What `wp.tid()` returns.
+        arguments: All arguments of a launch: small tensors and numbers.
+        steps: A few short lines that say what happens in registers.
+
+    Returns:
+        A picture. A cell that ends with this call shows it. None, with a hint, if the kernel is not answered yet.
+    """
+    try:
+        trace = trace_thread(kernel, thread, arguments)
+    except NotImplementedError as error:
+        if error.args:
+            raise
+        print(_NOT_YET)
+        return None
+    title = f"{kernel.func.__name__}, thread {thread}: {trace.bytes} bytes"
+    return draw_thread(title, trace.reads, steps, trace.writes)
+
+
+class _Element(float):
+    """A number read from an array. It knows where from, so that `array[i] += x`, which is atomic, can be told apart."""
+
+    home: tuple[Any, ...] | None = None
+    added = False
+
+    def __iadd__(self, other: float) -> "_Element":
+        element = _Element(float(self) + other)
+        element.home, element.added = self.home, True
+        return element
+
+
+class _Recorded:
+    """A copy of an array that notes which of its elements are read, written and added to."""
+
+    def __init__(self, name: str, values: np.ndarray) -> None:
+        self.name, self.values, self.shape = name, values.copy(), values.shape
+        self.dtype: type = float if np.issubdtype(values.dtype, np.floating) else int
+        self.read: dict[tuple[int, ...], None] = {}  # dictionaries, as sets that keep their order
+        self.written: dict[tuple[int, ...], None] = {}
+        self.added: dict[tuple[int, ...], None] = {}
+
+    def _checked(self, index: Any) -> tuple[int, ...]:
+        index = tuple(int(i) for i in (index if isinstance(index, tuple) else (index,)))
+        if len(index) != len(self.shape) or not all(0 <= i < n for i, n in zip(index, self.shape, strict=True)):
+            raise IndexError(f"the thread touches {self.name}{list(index)}; its shape is {self.shape}")
+        return index
+
+    def __getitem__(self, index: Any) -> Any:
+        index = self._checked(index)
+        self.read[index] = None
+        if self.dtype is int:
+            return int(self.values[index])
+        element = _Element(self.values[index])
+        element.home = (self.name, index)
+        return element
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        index = self._checked(index)
+        self.values[index] = value
+        if isinstance(value, _Element) and value.added and value.home == (self.name, index):
+            self.read.pop(index, None)
+            self.added[index] = None
+        else:
+            self.written[index] = None
+
+    def add(self, index: Any, value: float) -> None:
+        index = self._checked(index)
+        self.values[index] += value
+        self.added[index] = None
+
+    def cells(self, touched: dict[tuple[int, ...], None], mark: str = "") -> Cells:
+        """Returns the touched elements in a drawing of two dimensions: the last half of the axes side by side."""
+        shape = self.shape if len(self.shape) > 1 else (1, *self.shape)
+        rows = math.prod(shape[: len(shape) // 2])
+        flat = (np.ravel_multi_index(index, self.shape) for index in touched)
+        columns = max(math.prod(shape) // rows, 1)
+        return Cells(self.name + mark, (rows, columns), [divmod(int(i), columns) for i in flat])
+
+
+class _WarpInPython:
+    """What a kernel that is replayed in Python finds under the name `wp`."""
+
+    float32 = float64 = float
+    int32 = int64 = int
+
+    def __init__(self, thread: int | tuple[int, ...]) -> None:
+        self.tid = lambda: thread
+
+    @staticmethod
+    def where(condition: bool, if_true: Any, if_false: Any) -> Any:
+        return if_true if condition else if_false
+
+    @staticmethod
+    def atomic_add(array: _Recorded, *arguments: Any) -> None:
+        array.add(arguments[:-1], arguments[-1])
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(wp, name)
+        if not isinstance(value, wp.Function | type):
+            return value
+        return lambda *arguments: value(*(float(x) if isinstance(x, _Element) else x for x in arguments))
+
+
+def _in_python(function: FunctionType, stand_in: _WarpInPython) -> FunctionType:
+    """Returns a kernel's function with another `wp`, and so are the functions that it calls."""
+    scope: dict[str, Any] = {}
+    for name in function.__code__.co_names:
+        value = function.__globals__.get(name)
+        if value is wp:
+            scope[name] = stand_in
+        elif value in (wp.float32, wp.float64):
+            scope[name] = float
+        elif isinstance(value, wp.Function) and value.func is not None:
+            scope[name] = _in_python(value.func, stand_in)
+        elif name in function.__globals__:
+            scope[name] = value
+    return FunctionType(function.__code__, scope, closure=function.__closure__)
 
 
 def draw_thread(title: str, reads: Sequence[Cells], steps: str, writes: Sequence[Cells]) -> Image:

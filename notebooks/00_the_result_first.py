@@ -356,7 +356,8 @@ def flying(predicted, one, other, gap):
 # | [03 · Between the pixels](03_between_the_pixels.ipynb) | the blend of four neighbours | why fixed weights are right on planes and wrong at edges |
 # | [04 · Values](04_values.ipynb) | LIIF, a network that predicts ranges | what predicting values does to edges and walls |
 # | [05 · Weights](05_weights.ipynb) | ILN, a network that predicts weights | the same training, and how much further it gets |
-# | [06 · A fused op](06_a_fused_op.ipynb) | a differentiable kernel, forward and backward | where time goes: memory |
+# | [06a · Gradients in Warp](06a_gradients_in_warp.ipynb) | kernels that Warp differentiates | when its gradients are wrong |
+# | [06b · A fused op](06b_a_fused_op.ipynb) | a kernel and its backward by hand, as a PyTorch op | where time goes: memory |
 # | [07 · Attention](07_attention.ipynb) | attention among four neighbours | how to project 64 times less often for the same result |
 # | [08 · The comparison](08_the_comparison.ipynb) | the paper's table | what to believe of it |
 # | [09 · Your own sensor](09_your_own_sensor.ipynb) | your sensor, your file | what breaks, and where to go next |

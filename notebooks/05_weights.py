@@ -532,4 +532,4 @@ def prior_scores(r, a):
 #
 # ## Next
 #
-# [06 · A fused op](06_a_fused_op.ipynb) opens `gather_blend`: the kernel, its gradient by hand, and why it is fast.
+# [06a · Gradients in Warp](06a_gradients_in_warp.ipynb) and 06b open `gather_blend`: its gradient, and why it is fast.

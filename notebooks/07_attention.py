@@ -29,7 +29,7 @@
 #
 # | | |
 # |---|---|
-# | You know | weights (05), a fused op (06); `nn.Module`, `nn.Linear`, `nn.LayerNorm` |
+# | You know | weights (05), a fused op (06b); `nn.Module`, `nn.Linear`, `nn.LayerNorm` |
 # | Time | 40 minutes, and 25 for the exercises; one to two minutes to run |
 # | Hardware | any computer; a CUDA GPU is used if there is one |
 #
@@ -321,7 +321,7 @@ assert count(1) == 512 + 49152 + 2 * 1024 + 16384 + 32768 + 256
 # %%
 @wp.func
 def softmax4(s: wp.vec4):
-    """Weights of four scores, see notebook 06."""
+    """Weights of four scores, see notebook 06b."""
     w = s
     largest = wp.max(s)
     for t in range(4):
@@ -745,7 +745,7 @@ for name, values in clock.items():
 #
 # Where this page was built hoisting alone gained nothing: it saves multiplications, but in plain PyTorch it pays for
 # them with memory, since each token gathers 259 numbers of its pixel instead of 64 and passes over them again and
-# again. That is what notebook 06 was about. In one kernel, where what is gathered stays in registers, both gains come
+# again. That is what notebook 06b was about. In one kernel, where what is gathered stays in registers, both gains come
 # together. At an eighth of a query per pixel, though, it is better not to hoist at all, as the count says.
 #
 # ## 5. Does attention help? Train and see

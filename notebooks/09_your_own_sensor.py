@@ -988,4 +988,4 @@ for name, model in tried.items():
 # ## Next
 #
 # This was the last notebook. Try `python -m ilnet demo --scan frame.npz --rows 16` with a scan of your own, or read the
-# ops behind it all: `kernels/gather_blend.py` is the kernel of [06 · A fused op](06_a_fused_op.ipynb).
+# ops behind it all: `kernels/gather_blend.py` is the kernel of [06b · A fused op](06b_a_fused_op.ipynb).

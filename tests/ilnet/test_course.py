@@ -8,9 +8,11 @@ import numpy as np
 import PIL.Image
 import pytest
 import pyvista
+import torch
+import warp as wp
 from IPython.display import Image
 
-from ilnet.course import Cells, check, draw_thread, show_scene, slide
+from ilnet.course import Cells, check, draw_thread, draw_trace, run, show_scene, slide, trace_thread, yours_or
 
 
 def test_a_check_says_right_or_not_yet_and_raises_what_is_wrong(capsys):
@@ -53,6 +55,79 @@ def test_sliders_where_somebody_sits_and_elsewhere_their_middle(monkeypatch):
     slide(lambda **at: drawn.append(at), **values)
     assert len(drawn) == 1
     assert shown == [values]
+
+
+def test_an_answer_has_a_stand_in_until_it_is_given():
+    def not_yet(x):
+        raise NotImplementedError
+
+    def broken(x):
+        raise NotImplementedError("Could not run 'aten::bmm'")
+
+    assert yours_or(abs, not_yet)(-2) == 2
+    assert yours_or(abs, lambda x: 10 * x)(-2) == -20
+    with pytest.raises(NotImplementedError, match="aten"):
+        yours_or(abs, broken)(-2)
+
+
+@wp.func
+def right_of(columns: wp.array[int], i: int, width: int):
+    return (columns[i] + 1) % width
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def scatter_kernel(
+    columns: wp.array[int],
+    values: wp.array2d[float],
+    scale: float,
+    sums_out: wp.array2d[float],
+    counts_out: wp.array[float],
+    copies_out: wp.array[float],
+):
+    i, k = wp.tid()
+    j = right_of(columns, i, sums_out.shape[1])
+    sums_out[k, j] += scale * wp.max(values[i, k], wp.float32(0.0))
+    wp.atomic_add(counts_out, j, 1.0)
+    copies_out[j] = copies_out[j] + 1.0  # a race
+
+
+def scattered():
+    columns = torch.tensor([0, 1, 2, 2], dtype=torch.int32)
+    return [columns, torch.ones(4, 2), 3.0, torch.zeros(2, 3), torch.zeros(3), torch.zeros(3)]
+
+
+def test_a_trace_shows_what_one_thread_of_a_kernel_touches():
+    arguments = scattered()
+    trace = trace_thread(scatter_kernel, (1, 0), arguments)
+    assert trace.reads == [
+        Cells("columns", (1, 4), [(0, 1)]),
+        Cells("values", (4, 2), [(1, 0)]),
+        Cells("copies_out", (1, 3), [(0, 2)]),
+    ]
+    assert trace.writes == [
+        Cells("copies_out", (1, 3), [(0, 2)]),
+        Cells("sums_out +=", (2, 3), [(0, 2)]),
+        Cells("counts_out +=", (1, 3), [(0, 2)]),
+    ]
+    assert trace.bytes == 4 * (3 + 1 + 2 * 2)
+    assert all(x.sum() == 0 for x in arguments[3:]), "only a launch changes the arguments"
+    assert isinstance(draw_trace(scatter_kernel, (1, 0), arguments, "scale"), Image)
+    with pytest.raises(IndexError, match=r"the thread touches columns\[4\]; its shape is \(4,\)"):
+        trace_thread(scatter_kernel, (4, 0), arguments)
+
+
+def test_run_launches_on_tensors_and_an_exercise_is_neither_launched_nor_drawn(capsys):
+    @wp.kernel(enable_backward=False, module="unique")
+    def open_kernel(sums_out: wp.array[float]):
+        raise NotImplementedError
+
+    *inputs, sums, counts, copies = scattered()
+    run(scatter_kernel, (4, 2), inputs, [sums, counts, copies])
+    assert sums.tolist() == [[6, 3, 3]] * 2
+    with pytest.raises(NotImplementedError):
+        run(open_kernel, 3, [], [counts])
+    assert draw_trace(open_kernel, 0, [counts], "") is None
+    assert "Not answered yet" in capsys.readouterr().out
 
 
 @pytest.fixture

@@ -81,7 +81,7 @@ def test_every_exercise_has_a_solution_a_check_and_an_answer_that_is_refused(sou
 def test_its_head_says_what_it_is_about_and_its_picture_is_there(source):
     notebook = written(source)
     head = notebook.cells[0].source
-    assert re.match(rf"# {source.stem[:2]} · \S", head)
+    assert re.match(rf"# {source.stem.split('_')[0]} · \S", head)
     [(words, picture)] = re.findall(r"!\[([^]]+)\]\(([^)]+)\)", head)
     assert picture == f"pictures/{source.stem}.png"
     assert len(words) > 60, "the picture in words, for those who cannot see it"
