@@ -293,13 +293,22 @@ def _json(value: Any) -> str:
 @click.argument("source", metavar="IN", type=Path)
 @click.argument("out", metavar="OUT", type=Path)
 @click.option("--size", type=_Size(), help="Rays to predict, over the same field of view.")
-@click.option("--sensor", metavar="NAME|FILE", help="Preset or table to predict, instead of --size.")
+@click.option("--sensor", "--to", metavar="NAME|FILE", help="Preset or table to predict, instead of --size.")
 @click.option("--model", "name", default="iln-surfaces", show_default=True, metavar="NAME|FILE")
 @click.option(
     "--from",
     "origin",
     metavar="NAME|FILE",
     help="Preset or table with the angles of IN, if its files do not hold them.",
+)
+@click.option("--topic", metavar="NAME", help="Topic of the clouds in a bag, where there are several.")
+@click.option("--metadata", type=Path, metavar="FILE", help="Metadata (JSON) of the Ouster sensor of a capture.")
+@click.option(
+    "--precision",
+    type=click.Choice(["float32", "bfloat16"]),
+    default="float32",
+    show_default=True,
+    help="Of the network's layers, for a recording; bfloat16 is faster on processors that have it.",
 )
 @click.option(
     "--format",
@@ -322,21 +331,31 @@ def upsample(
     sensor: str | None,
     name: str,
     origin: str | None,
+    topic: str | None,
+    metadata: Path | None,
+    precision: str,
     suffix: str | None,
     min_confidence: float | None,
 ) -> None:
-    """Make a denser scan of the file IN, or of each file in the folder IN."""
+    """Make a denser scan of the file IN, of each file in the folder IN, or of each scan in a bag or capture IN."""
     if bool(size) == bool(sensor):
         raise click.UsageError("give --size ROWSxCOLUMNS or --sensor NAME")
-    if suffix and not source.is_dir():
-        raise click.UsageError("--format goes with a folder; the suffix of OUT says the format of one file")
     from ilnet import models, sensor_files
-    from ilnet.commands import upsample
+    from ilnet.commands import recordings, upsample
 
+    recording = recordings.is_recording(source)
+    if suffix and not (source.is_dir() or recording):
+        raise click.UsageError("--format goes with a folder; the suffix of OUT says the format of one file")
+    if not recording and (topic or metadata or precision != "float32"):
+        raise click.UsageError("--topic, --metadata and --precision go with a bag or a capture")
     target = size or sensor_files.named(str(sensor))
-    sensors = target, sensor_files.named(origin) if origin else None
+    measured = sensor_files.named(origin) if origin else None
     model, ending = models.load(name), f".{suffix or 'npz'}"
-    written, failed = upsample.run(source, out, model, *sensors, ending, min_confidence)
+    if recording:
+        dense = recordings.Densifier(model, target, precision, min_confidence)
+        written, failed = recordings.run(source, out, dense, measured, topic, metadata, ending)
+    else:
+        written, failed = upsample.run(source, out, model, target, measured, ending, min_confidence)
     if written:
         click.echo(f"{written} scan(s) written to {out}" + (f", {failed} could not be: see above" if failed else ""))
     if failed:
