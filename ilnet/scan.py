@@ -161,6 +161,7 @@ class Scan:
         intensity: torch.Tensor | np.ndarray | None = None,
         confidence: torch.Tensor | np.ndarray | None = None,
         time: torch.Tensor | np.ndarray | None = None,
+        rows: torch.Tensor | np.ndarray | None = None,
     ) -> "Scan":
         """Returns the range image of a point cloud.
 
@@ -173,6 +174,7 @@ class Scan:
             intensity: (N,) strength of each point, from 0 to 1.
             confidence: (N,) probability of each point that it is right to 10 cm.
             time: (N,) seconds of each point since the first.
+            rows: (N,) the row of each point, where its beam is known; None takes the nearest by elevation.
 
         Raises:
             ValueError: If an argument has another shape, no point is in view, or a point in view has an intensity,
@@ -193,6 +195,11 @@ class Scan:
         distance = xyz.norm(dim=1)
         usable = (distance.isfinite() & (distance > 0)).nonzero().squeeze(1)
         pixels = sensor.locate(*directions_to_angles(xyz[usable]))
+        if rows is not None:
+            rows = real_tensor("rows", rows).to(pixels)
+            if rows.shape != points.shape[:1]:
+                raise ValueError(f"rows has shape {tuple(rows.shape)}; it should be ({len(points)},), as points")
+            pixels[:, 0] = rows[usable]
         in_view = sensor.contains(pixels)
         if not in_view.any():
             raise ValueError(

@@ -20,6 +20,7 @@ FLOORS = [
     {"ilnet.sensor_files"},
     {"ilnet.sensor"},
     {"ilnet.sensors"},
+    {"ilnet.memory"},
     {"kernels"},
 ]
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}

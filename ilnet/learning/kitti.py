@@ -83,10 +83,8 @@ def files(paths: Sequence[Path]) -> list[Path]:
 
 def _points(path: Path) -> np.ndarray:
     """Returns the finite points (N, 3) of a file, in its order [m]."""
-    try:
-        points = scan_files.kitti_points(path)[:, :3].astype(np.float64)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    columns = scan_files.read_points(path, columns=4)
+    points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
     return points[np.isfinite(points).all(1)]
 
 

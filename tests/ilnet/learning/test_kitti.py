@@ -101,5 +101,5 @@ def test_other_files_are_refused(drive):
     with pytest.raises(FileNotFoundError, match="nowhere"):
         kitti.files([drive / "nowhere"])
     (drive / "cut.bin").write_bytes(b"12345")
-    with pytest.raises(ValueError, match=r"cut.bin: its 5 bytes are not whole KITTI points"):
+    with pytest.raises(ValueError, match=r"cut.bin: its 5 bytes are not whole points of 4 float32"):
         kitti.judge({}, [drive / "cut.bin"])
