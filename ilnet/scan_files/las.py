@@ -30,7 +30,10 @@ def read_points(path: Path) -> Points:
                 for ours, own in standard([*XYZ, *record.point_format.dimension_names]).items()
                 if ours not in XYZ
             }
-            return {ours: np.array(record[own]) for ours, own in names.items()}
+            found = {ours: np.array(record[own]) for ours, own in names.items()}
+            if not found["intensity"].any():  # nobody set it
+                del found["intensity"]
+            return found
     except (KeyboardInterrupt, SystemExit):
         raise
     except BaseException as error:  # laspy raises many kinds on damaged files, and lazrs panics beside them all
