@@ -380,7 +380,7 @@ def _weights(study: Study, of: _Asked, networks: Mapping[str, models.Model]) -> 
     study.write("where-weights", rows)
     truth = of.pairs[0][1]
     shown = sector(truth)
-    shown = slice(shown.start, (shown.start + shown.stop) // 2)  # wide enough to see single queries
+    shown = slice(shown.start, (3 * shown.start + shown.stop) // 4)  # few enough columns to see single queries
     bits_of = {name: entropy(found) for name, found in maps.items()}
     where_pictures.weights(maps, bits_of, rows, truth, shown, study.out / "where-weights.png")
     total = torch.stack(heads).sum(0)

@@ -177,10 +177,13 @@ def weights(
         title = f"{name}: entropy of {count} [bits]"
         picture = _draw(axes[4], bits[name], truth, columns, title, cmap="cividis", vmin=0, vmax=math.log2(count))
         line.colorbar(picture, ax=axes[4], pad=0.02).ax.tick_params(labelsize=7)
+        axes[0].set_ylabel("elevation [°]", fontsize=8)
     axis, bars, words = bottom.subplots(1, 3, width_ratios=(1.2, 3, 1))
     depth = _draw_truth(axis, truth, columns)
     bottom.colorbar(depth, ax=axis, pad=0.02).ax.tick_params(labelsize=7)
     axis.set_title("truth: range [m]", fontsize=9)
+    axis.set_xlabel("azimuth [°]", fontsize=8)
+    axis.set_ylabel("elevation [°]", fontsize=8)
     kinds, spread = _unique(rows, "of"), _unique(rows, "spread")
     for number, kind in enumerate(kinds):
         here = [row for row in rows if row["of"] == kind]
