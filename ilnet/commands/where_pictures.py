@@ -197,7 +197,7 @@ def weights(
     bars.set_title("by spread of the four neighbours", fontsize=9)
     words.axis("off")
     words.legend(*bars.get_legend_handles_labels(), fontsize=8, loc="center left")
-    figure.savefig(path, dpi=85)
+    figure.savefig(path, dpi=80)
 
 
 def heads(means: Mapping[str, np.ndarray], path: Path) -> None:
