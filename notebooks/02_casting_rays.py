@@ -110,8 +110,8 @@ draw_thread(
 # - it returns nothing. It writes into arrays that it was given, and **no two threads write to the same element**:
 #   nobody says which comes last. (On one core of a CPU threads run in turn, so that such a mistake may not show.)
 #
-# The decorator's two settings: Warp would also make the derivative of each kernel, for training. We need none here, and
-# `enable_backward=False` saves the time of compiling it. With `module="unique"` each kernel is compiled for itself;
+# The decorator's two settings: Warp would also make the derivative of each kernel, for training (notebook 06a). We need
+# none here, and `enable_backward=False` saves the time of compiling it. With `module="unique"` each kernel is compiled for itself;
 # otherwise all kernels of a notebook are compiled together, and a mistake in one stops them all.
 #
 # A launch hands over tensors. `wp.from_torch` makes a Warp array of a tensor **without a copy**: both see the same
@@ -218,7 +218,7 @@ assert torch.allclose(ground[0], 1.8 / torch.sin(-elevations[0]))  # h / sin(-el
 # %% [markdown]
 # ### Exercise 1 · Any plane
 #
-# ★☆☆ · 6 minutes
+# importance ★★★ · difficulty ★☆☆ · 6 minutes
 #
 # A plane is given by a normal $\mathbf n$, of any length but 0, and an offset $c$: its points are those with
 # $\mathbf n \cdot \mathbf p = c$. Write the `wp.func` `plane_range`: the range at which the ray meets the plane, 0
@@ -459,7 +459,7 @@ plt.show()
 #
 # ### Exercise 2 · A pole
 #
-# ★★☆ · 10 minutes
+# importance ★★☆ · difficulty ★★☆ · 10 minutes
 #
 # An upright pole without ends is an infinite cylinder: all points whose *horizontal* distance from the axis at
 # $(x_p, y_p)$ is $R$. Write the `wp.func` `pole_range`: the range to its surface from outside or inside, 0 where it is
@@ -579,7 +579,7 @@ def pole_range(origin: wp.vec3, direction: wp.vec3, x: float, y: float, radius: 
 # %% [markdown]
 # ### Exercise 3 · The nearest of many
 #
-# ★★☆ · 12 minutes
+# importance ★★★ · difficulty ★★☆ · 12 minutes
 #
 # One launch per sphere writes and reads a whole image for each. Let one thread look at all spheres instead, and keep
 # the nearest hit in a variable of its own. Write a kernel with a `for` loop over the spheres, and the function

@@ -212,6 +212,33 @@ tiny_scores = torch.randn(6, 4, device=device)
 unwritten = torch.full((6,), torch.nan, device=device)
 
 # %% [markdown]
+# A kernel to start from, which weighs the four pixels equally. What does one of its threads touch? `trace_thread` (06a)
+# replays thread 2, whose query is (2.2, 5.4), and counts the bytes.
+
+
+# %%
+@wp.kernel(module="unique", enable_backward=False)
+def mean_kernel(
+    # in
+    image: wp.array2d[Any],
+    queries: wp.array2d[Any],
+    # out
+    means_out: wp.array[Any],
+):
+    q = wp.tid()
+    total = image.dtype(0.0)
+    for t in range(4):
+        i, j = pixel(queries[q, 0], queries[q, 1], t, image.shape[0], image.shape[1])
+        total += image[i, j]
+    means_out[q] = total / image.dtype(4.0)
+
+
+draw_trace(mean_kernel, 2, [tiny, tiny_queries, unwritten], "one sum\nin a register")
+
+# %% [markdown]
+# *In words: the thread reads four pixels of the image, two by two, and one row of `queries`, and writes one element of
+# `means_out`: 28 bytes.*
+#
 # A kernel needs someone to launch it: the *host*, a Python function that makes the output and passes the tensors.
 # (`run` of `ilnet.course` hands them to Warp without a copy. On a CPU such a launch runs on one core.)
 
@@ -228,8 +255,8 @@ def blend_forward(image, queries, scores):
 #
 # importance ★★★ · difficulty ★★☆ · 10 minutes
 #
-# Write the body of `blend_kernel`. `wp.max` takes two numbers. If Warp refuses your kernel, read the last line of its
-# message.
+# Write the body of `blend_kernel`, beginning with `q = wp.tid()`. `wp.max` takes two numbers. If Warp refuses your
+# kernel, read the last line of its message.
 #
 # <details><summary>Hint: the outline</summary>
 #
@@ -358,8 +385,7 @@ def blend_kernel(
 draw_trace(blend_kernel, 2, [tiny, tiny_queries, tiny_scores, unwritten], "4 exponentials,\ntwo sums\nin registers")
 
 # %% [markdown]
-# *In words, once the kernel is there: four pixels of the image, two by two, one row each of `queries` and `scores`, and
-# one element of `blended_out`. The title has the number of bytes that this thread moves.*
+# *In words, once the kernel is there: the drawing of `mean_kernel`, with one row of `scores` more on the left.*
 #
 # ## 3. Backward by hand
 #

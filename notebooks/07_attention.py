@@ -17,12 +17,13 @@
 # weights of the four neighbours while the query crosses the cell of that edge, as stacked
 # bands](pictures/07_attention.png)
 #
-# **Goal.** You build the network that says the scores, see what attention can add to it, and cut its work to half
-# without changing what it computes.
+# **Goal.** You build the network that predicts the scores, write a kernel of its backward pass, see what attention can
+# add, and cut its work to half without changing what it computes.
 #
 # **After this notebook you can**
 #
 # - write multi-head attention among four tokens in a few lines, and as a kernel with one thread per query and head;
+# - derive the backward pass of attention, and write one term of it as a kernel;
 # - say what a network without attention (D = 0) cannot know;
 # - count multiply-adds, and hoist a projection out of a loop over queries into one over pixels;
 # - tell a difference between trained networks from noise.
@@ -30,10 +31,10 @@
 # | | |
 # |---|---|
 # | You know | weights (05), a fused op (06b); `nn.Module`, `nn.Linear`, `nn.LayerNorm` |
-# | Time | 40 minutes, and 25 for the exercises; one to two minutes to run |
+# | Time | 45 minutes, and 50 for the exercises; a minute to run |
 # | Hardware | any computer; a CUDA GPU is used if there is one |
 #
-# Each section but the first asks you for a prediction. Write it down before you run the next cell.
+# Most sections ask you for a prediction. Write it down before you run the next cell.
 
 # %%
 import csv
@@ -50,7 +51,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 import ilnet
 from ilnet import data, metrics, models, places
-from ilnet.course import Cells, check, draw_thread, slide
+from ilnet.course import check, draw_trace, run, slide
 from ilnet.models.base import OFFSET_SCALE
 from ilnet.sensor import angles_to_directions, preset
 from kernels import attend_neighbours, gather_neighbours, neighbour_attention, project_pixels
@@ -159,7 +160,7 @@ for depth in (0, 1, 2):
 # %% [markdown]
 # ### Exercise 1 · Attention that ignores
 #
-# ★★☆ · 10 minutes
+# importance ★★☆ · difficulty ★★☆ · 10 minutes
 #
 # A laser that met nothing has no surface to speak of. Write one head of attention in which some of the four tokens are
 # not listened to: `attend(q, k, v, valid)` with `q`, `k`, `v` (N, 4, d) and `valid` (N, 4), True for tokens to listen
@@ -329,47 +330,236 @@ def softmax4(s: wp.vec4):
     return w / (w[0] + w[1] + w[2] + w[3])
 
 
+@wp.func
+def attention_map(qkv: wp.array4d[float], n: int, h: int):
+    """P (4, 4) of head h of query n."""
+    p = wp.mat44()
+    for i in range(4):
+        logits = wp.vec4()
+        for d in range(qkv.shape[3]):
+            for j in range(4):
+                logits[j] += qkv[n, 3 * i, h, d] * qkv[n, 3 * j + 1, h, d]
+        p[i] = softmax4(logits / wp.sqrt(float(qkv.shape[3])))
+    return p
+
+
 @wp.kernel(module="unique", enable_backward=False)
-def _attend_kernel(
+def attend_kernel(
     # in
     qkv: wp.array4d[float],  # (Q, 12, heads, d): q, k, v of neighbour 0, then those of neighbour 1 ...
     # out
     attended_out: wp.array4d[float],  # (Q, 4, heads, d)
 ):
     n, h = wp.tid()
+    p = attention_map(qkv, n, h)
     for i in range(4):
-        logits = wp.vec4()
         for d in range(qkv.shape[3]):
-            for j in range(4):
-                logits[j] += qkv[n, 3 * i, h, d] * qkv[n, 3 * j + 1, h, d]
-        p = softmax4(logits / wp.sqrt(float(qkv.shape[3])))
-        for d in range(qkv.shape[3]):
-            mean = p[0] * qkv[n, 2, h, d] + p[1] * qkv[n, 5, h, d]
-            attended_out[n, i, h, d] = mean + p[2] * qkv[n, 8, h, d] + p[3] * qkv[n, 11, h, d]
+            mean = p[i, 0] * qkv[n, 2, h, d] + p[i, 1] * qkv[n, 5, h, d]
+            attended_out[n, i, h, d] = mean + p[i, 2] * qkv[n, 8, h, d] + p[i, 3] * qkv[n, 11, h, d]
 
 
 def attend_by_kernel(qkv):
     """(Q, 4, 3 C) -> (Q, 4, C) with 8 heads."""
     rows = qkv.reshape(len(qkv), 12, 8, -1)
     attended = torch.empty_like(rows[:, :4])
-    stream = wp.stream_from_torch(torch.cuda.current_stream()) if device == "cuda" else None
-    arrays = wp.from_torch(rows), wp.from_torch(attended)
-    wp.launch(_attend_kernel, (len(rows), 8), arrays[:1], arrays[1:], device=device, stream=stream)
+    run(attend_kernel, (len(rows), 8), [rows], [attended])
     return attended.flatten(2)
 
 
-# %%
-draw_thread(
-    "_attend_kernel: thread (n, h) lets the four neighbours of query n attend to each other in head h",
-    reads=[Cells("qkv[n], heads side by side", (12, 12), [(i, j) for i in range(12) for j in (3, 4, 5)])],
-    steps="P = softmax(q kᵀ / √d)\n4 x 4, in registers\nmean of v by P",
-    writes=[Cells("attended_out[n]", (4, 12), [(i, j) for i in range(4) for j in (3, 4, 5)])],
-)
+# %% tags=["hide-input"]
+few = torch.randn(1, 12, 4, 3)  # one query, 4 heads of 3 numbers
+draw_trace(attend_kernel, (0, 1), [few, few[:, :4]], "P = softmax(q kᵀ / √d)\n4 x 4, in registers\nmean of v by P")
 
 # %% [markdown]
-# *In words: on the left the twelve rows of one query: query, key and value of each of four neighbours. The thread reads
-# the columns of its own head from all of them, and writes the same columns of four rows on the right. The threads
-# beside it do the other heads.*
+# *In words: thread (n, h) lets the four neighbours of query n attend to each other in head h. On the left are the twelve
+# rows of one query: query, key and value of each of four neighbours, heads side by side. The thread reads the columns of
+# its own head from all of them, and writes the same columns of four rows on the right. The threads beside it do the
+# other heads.*
+#
+# ### Backwards
+#
+# Training needs the backward pass of that kernel. Let $G$ (4, d) be the gradient of the loss with respect to what one
+# head returned. First comes the gradient of the weights: $\mathrm{attend}_i = \sum_j P_{ij} \mathbf v_j$, so
+# $\partial L / \partial P_{ij} = \mathbf G_i \cdot \mathbf v_j$. Row $i$ of $P$ is a softmax, whose backward you wrote in
+# notebook 06b, with $\mathbf G_i \cdot \mathbf v_j$ in the place of the ranges:
+#
+# $$S_{ij} = P_{ij} \Big( \mathbf G_i \cdot \mathbf v_j - \sum_u P_{iu}\, \mathbf G_i \cdot \mathbf v_u \Big)$$
+#
+# is the gradient of the logits $\mathbf q_i \cdot \mathbf k_j / \sqrt d$. From there on everything is linear:
+#
+# | gradient of | is |
+# |---|---|
+# | the queries | $\partial L / \partial \mathbf q_i = \sum_j S_{ij}\, \mathbf k_j / \sqrt d$ |
+# | the keys | yours |
+# | the values | $\partial L / \partial \mathbf v_j = \sum_i P_{ij}\, \mathbf G_i$ |
+
+
+# %%
+def keys_backward(qkv, adj_attended):
+    """(Q, 4, 3 C), (Q, 4, C) -> the gradient of the keys (Q, 4, C), with 8 heads."""
+    rows, adj = qkv.reshape(len(qkv), 12, 8, -1), adj_attended.reshape(len(qkv), 4, 8, -1)
+    adj_keys = torch.empty_like(adj)
+    run(keys_backward_kernel, (len(rows), 8), [rows, adj], [adj_keys])
+    return adj_keys.flatten(2)
+
+
+# %% [markdown]
+# ### Exercise 2 · The gradient of the keys
+#
+# importance ★★☆ · difficulty ★★★ · 20 minutes
+#
+# Write `keys_backward_kernel`, one thread per query and head: `adj_keys_out[n, j, h]` is
+# $\partial L / \partial \mathbf k_j$. Key $\mathbf k_j$ takes part in the logits of *all* tokens $i$. Use `attention_map`.
+# In `qkv`, token t has its query at row 3 t, its key at 3 t + 1 and its value at 3 t + 2.
+#
+# <details><summary>Hint: the formula</summary>
+#
+# $\partial L / \partial \mathbf k_j = \sum_i S_{ij}\, \mathbf q_i / \sqrt d$.
+#
+# </details>
+# <details><summary>Hint: the outline</summary>
+#
+# `s = wp.mat44()`. Loop over i, d and j and add $G_{id} v_{jd}$ to `s[i, j]`. Then, for each row, compute the mean and
+# replace `s[i, j]`. Then loop over j and d: a local sum over i, divided by $\sqrt d$, and one element written.
+#
+# </details>
+
+
+# %% tags=["exercise"]
+@wp.kernel(module="unique", enable_backward=False)
+def keys_backward_kernel(
+    # in
+    qkv: wp.array4d[float],  # (Q, 12, heads, d)
+    adj_attended: wp.array4d[float],  # (Q, 4, heads, d): G
+    # out
+    adj_keys_out: wp.array4d[float],  # (Q, 4, heads, d)
+):
+    raise NotImplementedError
+
+
+# %% tags=["solution"]
+@wp.kernel(module="unique", enable_backward=False)
+def keys_backward_kernel(
+    # in
+    qkv: wp.array4d[float],  # (Q, 12, heads, d)
+    adj_attended: wp.array4d[float],  # (Q, 4, heads, d): G
+    # out
+    adj_keys_out: wp.array4d[float],  # (Q, 4, heads, d)
+):
+    n, h = wp.tid()
+    p = attention_map(qkv, n, h)
+    s = wp.mat44()
+    for i in range(4):
+        for d in range(qkv.shape[3]):
+            for j in range(4):
+                s[i, j] += adj_attended[n, i, h, d] * qkv[n, 3 * j + 2, h, d]
+        mean = wp.dot(p[i], s[i])
+        for j in range(4):
+            s[i, j] = p[i, j] * (s[i, j] - mean)
+    for j in range(4):
+        for d in range(qkv.shape[3]):
+            total = float(0.0)
+            for i in range(4):
+                total += s[i, j] * qkv[n, 3 * i, h, d]
+            adj_keys_out[n, j, h, d] = total / wp.sqrt(float(qkv.shape[3]))
+
+
+# %% tags=["check"]
+@check
+def _():
+    generator = torch.Generator().manual_seed(3)
+    qkv, adj = torch.randn(5, 4, 192, generator=generator), torch.randn(5, 4, 64, generator=generator)
+    qkv, adj = qkv.to(device), adj.to(device)
+    leaf = qkv.clone().requires_grad_()
+    attend_neighbours(leaf, heads=8, backend="torch").backward(adj)
+    true, mine = leaf.grad[..., 64:128], keys_backward(qkv, adj)
+    assert mine.isfinite().all(), "some elements are not written, or not finite"
+    ratio = (mine / true).median()
+    assert not torch.allclose(mine, true * math.sqrt(8), atol=1e-4), (
+        "everything is too large by √8: the scale of logits"
+    )
+    same = keys_backward(torch.cat((qkv[..., :128], torch.ones_like(qkv[..., 128:])), -1), adj)
+    assert same.abs().max() < 1e-4, "where all values are equal no weight matters: zeros. Is the mean subtracted in S?"
+    assert torch.allclose(mine, true, atol=1e-4), (
+        f"token 0 of query 0 begins {true[0, 0, :3].tolist()}, yours {mine[0, 0, :3].tolist()} (median ratio "
+        f"{ratio:.2f}): is the sum over i, the tokens that ask?"
+    )
+    assert torch.allclose(keys_backward(qkv, 3 * adj), 3 * true, atol=1e-3), "three times the gradient should triple it"
+
+
+# %% tags=["wrong"]
+@wp.kernel(module="unique", enable_backward=False)
+def keys_backward_kernel(
+    qkv: wp.array4d[float], adj_attended: wp.array4d[float], adj_keys_out: wp.array4d[float]
+):  # the queries' formula, with queries for keys: S is not transposed
+    n, h = wp.tid()
+    p = attention_map(qkv, n, h)
+    for i in range(4):
+        s = wp.vec4()
+        for d in range(qkv.shape[3]):
+            for j in range(4):
+                s[j] += adj_attended[n, i, h, d] * qkv[n, 3 * j + 2, h, d]
+        mean = wp.dot(p[i], s)
+        for d in range(qkv.shape[3]):
+            total = float(0.0)
+            for j in range(4):
+                total += p[i, j] * (s[j] - mean) * qkv[n, 3 * j, h, d]
+            adj_keys_out[n, i, h, d] = total / wp.sqrt(float(qkv.shape[3]))
+
+
+# %% tags=["wrong"]
+@wp.kernel(module="unique", enable_backward=False)
+def keys_backward_kernel(
+    qkv: wp.array4d[float], adj_attended: wp.array4d[float], adj_keys_out: wp.array4d[float]
+):  # the mean is not subtracted
+    n, h = wp.tid()
+    p = attention_map(qkv, n, h)
+    s = wp.mat44()
+    for i in range(4):
+        for d in range(qkv.shape[3]):
+            for j in range(4):
+                s[i, j] += p[i, j] * adj_attended[n, i, h, d] * qkv[n, 3 * j + 2, h, d]
+    for j in range(4):
+        for d in range(qkv.shape[3]):
+            total = float(0.0)
+            for i in range(4):
+                total += s[i, j] * qkv[n, 3 * i, h, d]
+            adj_keys_out[n, j, h, d] = total / wp.sqrt(float(qkv.shape[3]))
+
+
+# %% tags=["wrong"]
+@wp.kernel(module="unique", enable_backward=False)
+def keys_backward_kernel(
+    qkv: wp.array4d[float], adj_attended: wp.array4d[float], adj_keys_out: wp.array4d[float]
+):  # the scale is forgotten
+    n, h = wp.tid()
+    p = attention_map(qkv, n, h)
+    s = wp.mat44()
+    for i in range(4):
+        for d in range(qkv.shape[3]):
+            for j in range(4):
+                s[i, j] += adj_attended[n, i, h, d] * qkv[n, 3 * j + 2, h, d]
+        mean = wp.dot(p[i], s[i])
+        for j in range(4):
+            s[i, j] = p[i, j] * (s[i, j] - mean)
+    for j in range(4):
+        for d in range(qkv.shape[3]):
+            total = float(0.0)
+            for i in range(4):
+                total += s[i, j] * qkv[n, 3 * i, h, d]
+            adj_keys_out[n, j, h, d] = total
+
+
+# %% [markdown]
+# The trace of your kernel: the same rows as forward and those of $G$ in, the gradients of four keys out.
+
+# %%
+draw_trace(keys_backward_kernel, (0, 1), [few, few[:, :4], few[:, :4]], "P again, then S,\nthen Sᵀ q / √d")
+
+# %% [markdown]
+# *In words, once the kernel is there: as the drawing above, with four more rows on the left.*
+#
+# ### The clock
 #
 # **Predict:** which takes longer, $M$ or the 4 × 4? Does it matter with what the 4 × 4 is computed?
 
@@ -498,9 +688,9 @@ print(f"whole attention step: largest difference {(step - plain).abs().max() / p
 assert (step - plain).abs().max() < 1e-4 * plain.abs().max()
 
 # %% [markdown]
-# ### Exercise 2 · Variance by moments
+# ### Exercise 3 · Variance by moments
 #
-# ★☆☆ · 10 minutes
+# importance ★★☆ · difficulty ★☆☆ · 10 minutes
 #
 # Write the quadratic yourself. `moments(z, W, b)`: from features `z` (P, C), `W` (C, 2) and `b` (C,) return `squares`
 # (P,), which is $\hat z^\top \hat z$, `u` (P, 2), and `gram` (2, 2), which is $N$. `variance(squares, u, gram, offsets,
@@ -600,9 +790,9 @@ def variance(squares, u, gram, offsets, channels):  # the mixed term once only
 # 16 × 1024 to 128 × 2048 asks 16 queries per pixel. Only the first block can be hoisted: after it, tokens are mixtures
 # of four pixels.
 #
-# ### Exercise 3 · Count it
+# ### Exercise 4 · Count it
 #
-# ★☆☆ · 7 minutes
+# importance ★☆☆ · difficulty ★☆☆ · 7 minutes
 #
 # Write `multiply_adds(queries, pixels, depth, hoisted)` for the decoder with C = 64, for a whole frame. Token by token
 # it is the table of section 3. Hoisted, the *first* block's $M$ costs 3 · 64² per pixel plus 4 · 2 · 3 · 64 per query
@@ -700,6 +890,7 @@ def by_op(queries):
     return neighbour_attention(table, queries, (block.out.weight, block.out.bias))
 
 
+# %%
 steps = {"token by token": by_tokens, "hoisted, PyTorch": by_hoisting, "neighbour_attention": by_op}
 per_pixel = [1 / 8, 1 / 2, 2, 8]
 clock = {name: [] for name in steps}
@@ -710,7 +901,10 @@ with torch.no_grad():
             clock[name].append(milliseconds(lambda way=way, some=some: way(some), repeats=6))
         assert torch.allclose(by_tokens(some), by_op(some), atol=1e-3)
         assert torch.allclose(by_tokens(some), by_hoisting(some), atol=1e-3)
+for name, values in clock.items():
+    print(f"{name:>20}: " + ", ".join(f"{ms:.1f} ms at {share:g}" for ms, share in zip(values, per_pixel, strict=True)))
 
+# %% tags=["hide-input"]
 shares = np.geomspace(1 / 32, 32, 50)
 counts = {
     "token by token": shares * (512 + 49152 + 2048 + 16384),
@@ -735,8 +929,6 @@ for axis in axes:
 axes[1].set_xticks(per_pixel, [f"{share:g}" for share in per_pixel])
 axes[1].set_xticks([], minor=True)
 plt.show()
-for name, values in clock.items():
-    print(f"{name:>20}: " + ", ".join(f"{ms:.1f} ms at {share:g}" for ms, share in zip(values, per_pixel, strict=True)))
 
 # %% [markdown]
 # *In words: two plots over the number of queries per pixel, both axes logarithmic. Left, counted multiply-adds: token
@@ -750,7 +942,7 @@ for name, values in clock.items():
 #
 # ## 5. Does attention help? Train and see
 #
-# The paper compares depths after days of training. We have a minute: three depths, the same batches of rays in one
+# The paper compares depths after days of training. We have half a minute: two depths, the same batches of rays in one
 # town, two starts (seeds) each, and one scan elsewhere in that town to test. Small encoders, 30 steps.
 #
 # **Predict:** which depth comes out ahead? And how far apart are two starts of the same depth?
@@ -786,7 +978,7 @@ def figures_of(model):
     return found["mae"], found["iou"]
 
 
-trained = {depth: [train(depth, seed) for seed in SEEDS] for depth in (0, 1, 2)}
+trained = {depth: [train(depth, seed) for seed in SEEDS] for depth in (0, 1)}
 
 # %%
 results = {depth: [figures_of(model) for model in runs] for depth, runs in trained.items()}
@@ -820,10 +1012,12 @@ with open(Path(ilnet.__file__).parent / "results" / "attention.csv") as file:
             )
 
 # %% [markdown]
-# Here is an order to believe, and it has one step. Without attention a network loses more than a fifth of its IoU, far
-# more than two starts of one depth differ by after 2000 steps (.01; notebook 08 draws three). **One block is all it
-# takes:** two and four change nothing that is larger than that, and cost three and six times as long. (D = 0 and D = 1
-# run in one fused kernel, `fused_decode`; deeper networks do not.) The paper uses one block, too.
+# Here is an order to believe, and it has one step. Without a block a network loses more than a fifth of its IoU, far
+# more than two starts of one depth differ by after 2000 steps (.01; notebook 08 draws three). Mind what that compares: a
+# block is attention *and* a feed-forward layer, and D = 0 has neither. This table cannot say which of the two is missed.
+# **One block is all it takes:** two and four change nothing that is larger than the noise, and cost three and six times
+# as long. (D = 0 and D = 1 run in one fused kernel, `fused_decode`; deeper networks do not.) The paper uses one block,
+# too.
 #
 # ## 6. The weights at an edge
 #
@@ -902,7 +1096,7 @@ def draw_edge(row=9.5):
     plt.show()
 
 
-# %% tags=["goal"]
+# %% tags=["goal", "hide-input"]
 draw_edge()
 
 # %%
@@ -927,6 +1121,57 @@ assert on_left[-1] < 0.1
 # the air between pillar and wall. The network's weights switch. *Where* they switch is a guess from what the
 # surroundings look like; the image does not tell where in the cell the edge lies. But on either side of it the answer
 # is a surface that is there.
+#
+# Who listened to whom, on the way to these weights? Each head has a map $P$ (4, 4). Row i shows how token i shares out
+# its attention.
+#
+# **Predict:** in the cell of the edge, tokens 0 and 2 are on the wall, 1 and 3 on the pillar. Will a token listen to the
+# other one of its surface, or to the other surface?
+
+
+# %%
+@torch.no_grad()
+def attention_maps(row, columns):
+    """P (Q, 8, 4, 4) of the network's eight heads."""
+    queries = torch.stack((torch.full_like(columns, row), columns), -1)
+    z, offsets = gather_neighbours(encoded, queries[None].to(device))
+    x = z[0] + offsets[0] @ W.T + b
+    q, k, _ = block.qkv(block.norm(x)).unflatten(-1, (3, 8, -1)).unbind(-3)
+    return (torch.einsum("nihd,njhd->nhij", q, k) / math.sqrt(q.shape[-1])).softmax(-1).cpu()
+
+
+places_asked = {"on a flat wall, column 530.5": 530.5, f"at the edge, column {EDGE + 0.5}": EDGE + 0.5}
+maps = attention_maps(9.5, torch.tensor(list(places_asked.values())))
+across = torch.tensor([[False, True] * 2, [True, False] * 2] * 2)  # token i and token j on different surfaces
+for name, one in zip(places_asked, maps, strict=True):
+    shares_across = (one * across).sum((1, 2)) / 4
+    print(f"{name}: {shares_across.mean():.2f} of the attention goes to the other column; by head, ", end="")
+    print(" ".join(f"{share:.2f}" for share in shares_across))
+moved, spread = (maps[0] - maps[1]).abs().mean(), (maps[0] - maps[0].roll(1, 0)).abs().mean()
+print(f"between the two places a weight differs by {moved:.2f} on average, between two heads by {spread:.2f}")
+assert moved < spread
+
+# %% tags=["hide-input"]
+figure, grid = plt.subplots(2, 8, figsize=(10, 3), layout="constrained", sharex=True, sharey=True)
+for row_of_axes, name, heads in zip(grid, places_asked, maps, strict=True):
+    for number, (axis, one) in enumerate(zip(row_of_axes, heads, strict=True)):
+        shown = axis.imshow(one, cmap="cividis", vmin=0, vmax=1)
+        axis.set(title=f"head {number}" if axis in grid[0] else "", xticks=range(4), yticks=range(4))
+    row_of_axes[0].set_ylabel(name.split(",")[0] + "\ntoken i", fontsize=8)
+figure.supxlabel("token j, which it listens to", fontsize=9)
+figure.colorbar(shown, ax=grid, label="P")
+plt.show()
+
+# %% [markdown]
+# *In words: two rows of eight small 4 × 4 maps, above for a query on a flat wall, below for one at the edge. In most
+# heads each row has one bright square, and most squares are at the same place above and below.*
+#
+# Neither, for most heads. They listen by *place*: head 2 to the pixel of the same column in the upper row, heads 3 and 4
+# to the other column, head 7 to token 1, on the wall as at the edge. So a token gets to know the features of particular
+# neighbours, and what to make of the comparison is left to the layers that follow. A few heads change with the scene
+# (head 6 turns to the same column at the edge). These are two queries of one scene. Averaged over all queries of ten
+# scans it is the same: what a head listens to hardly depends on how far the neighbours are apart
+# (`python -m ilnet experiment where`).
 #
 # Another row. In a running notebook a slider moves it: look at rows of pixels (9.0) and between them, and below row 5,
 # where rays meet the road before they reach the wall.
