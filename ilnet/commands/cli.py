@@ -363,6 +363,93 @@ def upsample(
 
 
 @cli.command()
+@click.argument("source", metavar="SOURCE")
+@click.option("--size", type=_Size(), help="Rays to predict, over the same field of view.")
+@click.option("--sensor", "--to", metavar="NAME|FILE", help="Preset or table to predict, instead of --size.")
+@click.option("--model", "name", default="iln-surfaces", show_default=True, metavar="NAME|FILE")
+@click.option(
+    "--from", "origin", metavar="NAME|FILE", help="Preset or table of the sensor, if its packets do not tell it."
+)
+@click.option("--topic", metavar="NAME", help="Topic of the clouds in a bag, where there are several.")
+@click.option("--metadata", type=Path, metavar="FILE", help="Metadata (JSON) of the sensor, if it is an Ouster.")
+@click.option(
+    "--precision",
+    type=click.Choice(["float32", "bfloat16"]),
+    default="float32",
+    show_default=True,
+    help="Of the network's layers; bfloat16 is faster on processors that have it.",
+)
+@click.option("--min-confidence", type=float, metavar="P", help="Drop returns that are less likely right to 10 cm.")
+@click.option("--out", type=Path, metavar="PATH", help="Write to this bag, or folder of files; by default only show.")
+@click.option("--port", type=click.IntRange(0, 65535), metavar="N", help="Show on this port; 8000 without --out.")
+@click.option("--scans", type=click.IntRange(min=1), metavar="N", help="Stop after this many scans.")
+def stream(
+    source: str,
+    size: tuple[int, int] | None,
+    sensor: str | None,
+    name: str,
+    origin: str | None,
+    topic: str | None,
+    metadata: Path | None,
+    precision: str,
+    min_confidence: float | None,
+    out: Path | None,
+    port: int | None,
+    scans: int | None,
+) -> None:
+    """Make the scans of SOURCE denser as they come: a port of this machine such as udp://:2368, a bag or a capture.
+
+    Scans that come faster than the network runs are dropped and counted. Ctrl-C ends the stream and keeps the bag.
+    """
+    if bool(size) == bool(sensor):
+        raise click.UsageError("give --size ROWSxCOLUMNS or --sensor NAME")
+    from contextlib import ExitStack
+
+    from ilnet import models, sensor_files
+    from ilnet.commands import recordings, stream, viewer
+
+    target = size or sensor_files.named(str(sensor))
+    measured = sensor_files.named(origin) if origin else None
+    dense = recordings.Densifier(models.load(name), target, precision, min_confidence)
+    with ExitStack() as stack:
+        deliver = []
+        if port is not None or out is None:
+            server = stack.enter_context(viewer.Server(8000 if port is None else port))
+            click.echo(f"look at {server.address}", err=True)
+            deliver.append(lambda frame, scan: stream.show(server, frame, scan))
+        found = stream.run(source, deliver, dense, out, measured, topic, metadata, scans)
+    click.echo(found)
+    if found.problem:
+        raise click.UsageError(found.problem)
+
+
+@cli.command()
+@click.argument("files", nargs=-1, required=True, type=Path)
+@click.option("--from", "origin", metavar="NAME|FILE", help="Preset or table with the angles, if files lack them.")
+@click.option(
+    "--out",
+    type=Path,
+    default=Path("view.html"),
+    show_default=True,
+    metavar="FILE",
+    help="The page; a name that ends in .png makes a picture.",
+)
+def view(files: tuple[Path, ...], origin: str | None, out: Path) -> None:
+    """Show a scan, a denser one, how it differs from the first or a third, and its confidence, as points to turn."""
+    from ilnet import sensor_files
+    from ilnet.commands import view
+    from ilnet.scan_files import UnknownSensor
+
+    try:
+        view.run(files, out, sensor_files.named(origin) if origin else None)
+    except ValueError as error:
+        if isinstance(error.__cause__, UnknownSensor):
+            raise click.UsageError(f"{error}: --from NAME") from error
+        raise
+    click.echo(f"{out}: open it in a browser" if out.suffix == ".html" else out)
+
+
+@cli.command()
 @click.option(
     "--towns", metavar="NAMES", help="Towns, comma separated, a seed after a colon: town01:7. All by default."
 )

@@ -17,10 +17,10 @@ from ilnet.scan_files import bags, captures, clouds
 from ilnet.sensor import Sensor
 from ilnet.world import simulate
 
-__all__ = ["Densifier", "Frame", "Kind", "ahead", "frames_of", "is_recording", "run", "sink"]
+__all__ = ["TOPIC", "Densifier", "Frame", "Kind", "ahead", "frames_of", "is_recording", "run", "sink"]
 
 # Topic and frame of the clouds that a capture becomes: it names none.
-_TOPIC, _FRAME_ID = "/points", "lidar"
+TOPIC, _FRAME_ID = "/points", "lidar"
 _Item = TypeVar("_Item")
 
 
@@ -73,7 +73,7 @@ def frames_of(
     """
     if not bags.is_bag(source):
         found = (Frame(time, scan) for time, scan in captures.sweeps(source, sensor, metadata))
-        yield found, Kind(topic or _TOPIC)
+        yield found, Kind(topic or TOPIC)
         return
     with bags.Bag(source) as bag:
         name = bag.cloud_topic(topic)
