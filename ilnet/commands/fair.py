@@ -43,6 +43,7 @@ __all__ = [
     "REHEARSAL",
     "STARTS",
     "alignment",
+    "answer",
     "fair",
     "rehearsing",
     "variant",
@@ -66,17 +67,35 @@ _SIZE = {name: {"features": 32, "blocks": 8} | ({"hidden": 128} if name == "MLP"
 _TRAINING = {"steps": 1000, "validations": 2, "precision": "32-true"}
 
 
-def _answer(
-    kind: str, h: torch.Tensor, image: torch.Tensor, queries: torch.Tensor, wrap: bool, prior: str, model: Any
+def answer(
+    kind: str,
+    h: torch.Tensor,
+    image: torch.Tensor,
+    queries: torch.Tensor,
+    wrap: bool,
+    prior: str = "none",
+    norm_range: float = 100.0,
+    backend: str = "warp",
 ) -> torch.Tensor:
-    """Returns ranges (B, Q) [m], given the number (B, Q, 4) that was predicted for each neighbour."""
+    """Returns ranges (B, Q) [m], given the number that was predicted for each neighbour; the formulas stand above.
+
+    Args:
+        kind: One of `KINDS`.
+        h: (B, Q, 4), the predicted numbers.
+        image: (B, H, W) measured ranges [m].
+        queries: (B, Q, 2) pixel coordinates.
+        wrap: Whether the last column of the image is beside the first.
+        prior: What weights start from, see `kernels.gather_blend`.
+        norm_range: R [m].
+        backend: "warp" or "torch".
+    """
     if kind == "weights":
-        return gather_blend(image, queries, h, prior, wrap, area_floor=1e-4, backend=model.backend)
-    half = model.norm_range / 2
+        return gather_blend(image, queries, h, prior, wrap, area_floor=1e-4, backend=backend)
+    half = norm_range / 2
     if kind == "values":
-        return area_blend((h + 1) * half, queries, model.backend)
-    measured, _ = gather_neighbours(image.unsqueeze(1), queries, wrap, model.backend)
-    return area_blend(measured.squeeze(-1) + h * half, queries, model.backend)
+        return area_blend((h + 1) * half, queries, backend)
+    measured, _ = gather_neighbours(image.unsqueeze(1), queries, wrap, backend)
+    return area_blend(measured.squeeze(-1) + h * half, queries, backend)
 
 
 class _FeedForward(ILN):
@@ -103,7 +122,8 @@ class _Compared:
     def decode(self, encoded: Any, image: torch.Tensor, queries: torch.Tensor, wrap: bool) -> torch.Tensor:
         predict = self.values if isinstance(self, LIIF) else self.scores  # type: ignore[attr-defined]
         h = predict(encoded, queries, wrap).float()
-        return _answer(self.kind, h, image, queries, wrap, self.prior, self)
+        norm_range, backend = self.norm_range, self.backend  # type: ignore[attr-defined]
+        return answer(self.kind, h, image, queries, wrap, self.prior, norm_range, backend)
 
     def is_fused(self, encoded: Any) -> bool:
         return False
