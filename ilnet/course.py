@@ -1,12 +1,16 @@
-"""What the notebooks share: checks of exercises, sliders, 3-D scenes, traces of threads. Needs the extra `course`."""
+"""What the notebooks share: checks of exercises, one training, sliders, 3-D scenes, traces of threads.
+
+Needs the extra `course`.
+"""
 
 import inspect
 import io
 import math
 import os
 from collections.abc import Callable, Sequence
-from functools import wraps
+from functools import lru_cache, wraps
 from html import escape
+from itertools import islice
 from types import FunctionType
 from typing import Any, NamedTuple
 
@@ -19,13 +23,22 @@ from IPython.display import HTML, Image
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
+from torch import nn
+from tqdm import tqdm
+
+from ilnet import data, metrics, places, simulate
+from ilnet.scan import Pair
+from ilnet.sensor import PAPER_INPUT, PAPER_TARGET, Sensor
 
 __all__ = [
     "Cells",
+    "Fit",
     "Trace",
     "check",
     "draw_thread",
     "draw_trace",
+    "fit",
+    "held_out",
     "run",
     "show_scene",
     "slide",
@@ -58,6 +71,64 @@ def check(checks: Callable[[], object]) -> None:
         print(_NOT_YET)
     else:
         print("Right.")
+
+
+class Fit(NamedTuple):
+    """What `fit` returns."""
+
+    curve: dict[int, dict[str, float]]
+    """Figures on the held-out scan by step, see `metrics.compare`. Step 0 is the untrained network."""
+    answers: dict[int, torch.Tensor]
+    """Ranges (64, 1024) [m] that the network gave for that scan, by step."""
+
+
+@lru_cache(maxsize=2)
+def held_out(target: Sensor = PAPER_TARGET) -> Pair:
+    """Returns a scan of a town that `fit` does not train in, 16×1024, and what another sensor measures there."""
+    town = places.town("town05", device=simulate.best_device())
+    [pair] = places.held_out_scans(town, 1, [PAPER_INPUT, target])
+    return pair
+
+
+@lru_cache(maxsize=4)
+def _batches(steps: int, seed: int) -> list[data.Batch]:
+    streets = [places.town(name, device=simulate.best_device()) for name in ("town01", "town02")]
+    return list(islice(data.ContinuousRays(streets, PAPER_INPUT, crops=4, columns=64, queries=384, seed=seed), steps))
+
+
+def fit(model: nn.Module, steps: int = 120, seed: int = 0, looks: Sequence[int] = (0, 30, 60, 90, 120)) -> Fit:
+    """Trains a network as all notebooks do: on the same rays and with the same settings.
+
+    The loss is L1 in metres, the optimiser Adam with one cycle of its rate up to 1e-3. A step has 4 crops of 64 columns
+    and 384 rays in each, in two towns.
+
+    Args:
+        model: Called with `(images (B, 16, W) [m], queries (B, Q, 2), wrap)`, it returns ranges (B, Q) [m]. It goes to
+            the GPU if there is one.
+        steps: Number of steps.
+        seed: Of the rays. Networks that are compared have the same.
+        looks: Steps after which the network is measured on the scan of `held_out`.
+    """
+    scan, truth = held_out()
+    device = scan.ranges.device
+    image, queries = scan.filled()[None], PAPER_INPUT.grid_queries(truth.sensor).view(1, -1, 2).to(device)
+    optimizer = torch.optim.Adam(model.to(device).parameters(), 1e-3)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1e-3, steps)
+    found = Fit({}, {})
+    batches = tqdm(_batches(steps, seed), desc="training", leave=False, disable=not _somebody_is_there())
+    for step, batch in enumerate((None, *batches)):
+        if batch is not None:
+            crops, asked, ranges = (tensor.to(device) for tensor in (batch.image, batch.queries, batch.ranges))
+            loss = (model(crops, asked, batch.wrap) - ranges).abs().mean()  # metres
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+        if step in looks:
+            with torch.no_grad():
+                found.answers[step] = model(image, queries, True).view(truth.ranges.shape)
+            found.curve[step] = metrics.compare(found.answers[step], truth)
+    return found
 
 
 def slide(draw: Callable[..., object], **values: tuple[float, float, float]) -> None:

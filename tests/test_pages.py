@@ -48,19 +48,30 @@ SIZES = ("64x1024", "128x2048", "256x4096")
 
 @pytest.mark.parametrize(("page", "sizes"), [("README.md", SIZES[1:2]), ("ilnet/results/README.md", SIZES)])
 def test_the_figures_are_those_that_were_measured(page, sizes):
-    """For each size MAE, IoU and floating, then the paper's MAE and IoU."""
+    """Each size has a table, sorted by IoU; the best of a column is bold, and the paper's MAE and IoU stand last."""
     with open(ROOT / "ilnet" / "results" / "table.csv", newline="") as file:
-        measured = {(row["model"], row["size"]): row for row in csv.DictReader(file)}
-    rows = re.findall(r"^\| `([\w-]+)`[^|]*\|(.*)\|$", (ROOT / page).read_text(), re.MULTILINE)
-    rows = {name: cells.split("|") for name, cells in rows if cells.count("|") == 5 * len(sizes) - 1}
-    assert rows.keys() >= {"bilinear", "planes", "liif", "iln", "iln-surfaces"}
-    for name, cells in rows.items():
-        for number, size in enumerate(sizes):
-            ours, paper = cells[5 * number : 5 * number + 3], cells[5 * number + 3 : 5 * number + 5]
-            known, theirs = measured.get((name, size)), experiment.PAPER[size].get(name, ())[:2]
-            expected = [float(known[key]) for key in ("mae", "iou", "floating")] if known else []
-            assert [float(cell) for cell in ours if cell.strip()] == pytest.approx(expected, abs=6e-4)
-            assert [float(cell.strip(" *")) for cell in paper if cell.strip()] == list(theirs)
+        measured = list(csv.DictReader(file))
+    text = (ROOT / page).read_text()
+    for size in sizes:
+        [block] = re.findall(rf"^\| {size} \|.*\n\|[-|]+\n((?:\|.*\n)+)", text, re.MULTILINE)
+        lines = [[cell.strip(" |") for cell in line.split(" | ")] for line in block.splitlines()]
+        shown = [re.match(r"`([\w-]+)`", line[0])[1] for line in lines]
+        known = {row["model"]: row for row in measured if row["size"] == size and row["model"] in shown}
+        assert set(shown) >= {"bilinear", "planes", "liif", "iln", "iln-surfaces"}
+        assert shown == sorted(shown, key=lambda name: -float(known[name]["iou"]))
+        columns = ["mae", "iou", "floating", "chamfer"][: len(lines[0]) - 4]
+        best = {
+            key: (max if key == "iou" else min)(float(row[key]) for row in known.values() if row[key])
+            for key in columns
+        }
+        for name, line in zip(shown, lines, strict=True):
+            row = known[name]
+            assert line[1] == (row["minutes"] or "\N{EN DASH}")
+            for key, cell in zip(columns, line[2:], strict=False):
+                assert cell.strip("*") == (f"{float(row[key]):.3f}" if row[key] else "")
+                assert cell.startswith("**") == (bool(row[key]) and float(row[key]) == best[key])
+            paper = [f"*{value:.3f}*" for value in experiment.PAPER[size].get(name, ())[:2]]
+            assert line[-2:] == (paper or ["", ""])
 
 
 @pytest.mark.parametrize("page", ["README.md", "ilnet/world/README.md"])

@@ -240,22 +240,27 @@ def alignment(study: Study) -> None:
 
 
 def _draw(study: Study, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Draws the IoU of each case at each size: means over the seeds, and their spans."""
+    """Draws IoU and MAE of each case at each size: means over the seeds, and their spans."""
     found = by_case(rows, FAIR_KEYS)
     sizes = list(dict.fromkeys(size for *_, size in found))
-    figure = Figure(figsize=(10, 3.2), layout="constrained")
     cases = list(product((*DECODERS, CONTROL), STARTS))
-    for axis, size in zip(np.atleast_1d(figure.subplots(1, len(sizes), sharey=True)), sizes, strict=True):
-        for number, kind in enumerate(KINDS):
-            for at, (decoder, start) in enumerate(cases):
-                if (kind, decoder, start, size) not in found:
+    figure = Figure(figsize=(11, 5.6), layout="constrained")
+    grid = figure.subplots(2, len(sizes), sharex=True, sharey="row", squeeze=False)
+    for line, (key, words) in zip(grid, (("iou", "IoU"), ("mae", "MAE [m]")), strict=True):
+        for axis, size in zip(line, sizes, strict=True):
+            for (number, kind), (at, (decoder, start)) in product(enumerate(KINDS), enumerate(cases)):
+                figures = found.get((kind, decoder, start, size))
+                if figures is None:
                     continue
-                values = found[kind, decoder, start, size]["iou"]
                 where, label = at + 0.2 * (number - 1), kind if at == 0 else None
-                axis.plot([where, where], [min(values), max(values)], color=SERIES[number])
-                axis.plot(where, np.mean(values), "o", color=SERIES[number], label=label)
-        axis.set_xticks(range(len(cases)), [f"{decoder},\n{start}" for decoder, start in cases], fontsize=7)
+                axis.plot([where, where], [min(figures[key]), max(figures[key])], color=SERIES[number])
+                axis.plot(where, np.mean(figures[key]), "ovs"[number], color=SERIES[number], label=label)
+            axis.grid(axis="y", alpha=0.3)
+        line[0].set_ylabel(words)
+    for axis, size in zip(grid[0], sizes, strict=True):
         axis.set_title(size)
-    figure.axes[0].set_ylabel("IoU")
-    figure.axes[0].legend(fontsize=8)
+    for axis in grid[-1]:
+        names = [f"{decoder}, {start}" for decoder, start in cases]
+        axis.set_xticks(range(len(cases)), names, fontsize=7, rotation=35, ha="right")
+    grid[0][-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
     figure.savefig(study.out / "fair.png", dpi=120)
