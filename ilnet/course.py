@@ -24,7 +24,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Rectangle
 from torch import nn
-from tqdm import tqdm
+from tqdm import tqdm  # type: ignore[import-untyped]
 
 from ilnet import data, metrics, places, simulate
 from ilnet.scan import Pair
@@ -86,17 +86,22 @@ class Fit(NamedTuple):
 def held_out(target: Sensor = PAPER_TARGET) -> Pair:
     """Returns a scan of a town that `fit` does not train in, 16×1024, and what another sensor measures there."""
     town = places.town("town05", device=simulate.best_device())
-    [pair] = places.held_out_scans(town, 1, [PAPER_INPUT, target])
-    return pair
+    [(scan, truth)] = places.held_out_scans(town, 1, [PAPER_INPUT, target])
+    return scan, truth
+
+
+@lru_cache(maxsize=1)
+def _streets() -> list[places.Place]:
+    return [places.town(name, device=simulate.best_device()) for name in ("town01", "town02")]
 
 
 @lru_cache(maxsize=4)
 def _batches(steps: int, seed: int) -> list[data.Batch]:
-    streets = [places.town(name, device=simulate.best_device()) for name in ("town01", "town02")]
-    return list(islice(data.ContinuousRays(streets, PAPER_INPUT, crops=4, columns=64, queries=384, seed=seed), steps))
+    rays = data.ContinuousRays(_streets(), PAPER_INPUT, crops=4, columns=64, queries=384, seed=seed)
+    return list(islice(rays, steps))
 
 
-def fit(model: nn.Module, steps: int = 120, seed: int = 0, looks: Sequence[int] = (0, 30, 60, 90, 120)) -> Fit:
+def fit(model: nn.Module, steps: int = 120, seed: int = 0, looks: Sequence[int] = (0, 30, 60, 120)) -> Fit:
     """Trains a network as all notebooks do: on the same rays and with the same settings.
 
     The loss is L1 in metres, the optimiser Adam with one cycle of its rate up to 1e-3. A step has 4 crops of 64 columns
