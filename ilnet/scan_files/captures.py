@@ -100,6 +100,7 @@ class _Velodyne:
     def __init__(self, sensor: Sensor | None):
         self._library = _velodyne_decoder()
         self._sensor = sensor
+        self._model = 0
         self._stream: Any = None
 
     def feed(self, time: float, packet: bytes) -> Sweep | None:
@@ -110,12 +111,12 @@ class _Velodyne:
             if model is None or name not in PRESETS:
                 known = ", ".join(name for _, name in _VELODYNES.values() if name in PRESETS)
                 raise ValueError(f"its packets are of model {packet[-1]:#x}; it should be one of {known}")
-            self._sensor = self._sensor or preset(name)
+            self._model, self._sensor = packet[-1], self._sensor or preset(name)
             library = self._library
             self._stream = library.StreamDecoder(
                 library.Config(model=library.Model.__members__[model], timestamp_first_packet=True)
             )
-        return self._sweep(self._stream.decode(time, packet, True))
+        return self._sweep(self._stream.decode(time, packet, True)) if packet[-1] == self._model else None
 
     def finish(self) -> Sweep | None:
         return None if self._stream is None else self._sweep(self._stream.finish(True))
