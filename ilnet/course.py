@@ -388,7 +388,7 @@ def _in_python(function: FunctionType, stand_in: _WarpInPython) -> FunctionType:
         value = function.__globals__.get(name)
         if value is wp:
             scope[name] = stand_in
-        elif value in (wp.float32, wp.float64):
+        elif value is wp.float32 or value is wp.float64:
             scope[name] = float
         elif isinstance(value, wp.Function) and value.func is not None:
             scope[name] = _in_python(value.func, stand_in)

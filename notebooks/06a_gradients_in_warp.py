@@ -50,6 +50,8 @@ initialise()  # starts Warp without its greeting
 device = "cuda" if torch.cuda.is_available() else "cpu"
 real = wp.float64  # gradients are tested in double precision, so all kernels of this notebook use it
 double = {"dtype": torch.float64, "device": device}
+if device == "cuda":  # Warp's work queues behind PyTorch's
+    wp.set_stream(wp.stream_from_torch(torch.cuda.current_stream()))
 
 # %% [markdown]
 # ## 1. A tape

@@ -11,6 +11,9 @@ A source `NN_name.py` (jupytext, py:percent) becomes two notebooks: `NN_name.ipy
 - `check`: asserts that an answer is right;
 - `wrong`: one or more answers that the check should refuse. Only the tests run them.
 
+The text before an exercise has a card below its title: `importance ★★★ · difficulty ★★☆ · 10 minutes`. Cells that only
+draw are tagged `hide-input`.
+
 One cell is tagged `goal`. Its picture becomes `pictures/NN_name.png`, which the head of the notebook and the README show.
 """
 
