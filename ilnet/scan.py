@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from ilnet import holes
 from ilnet.sensor import Sensor, directions_to_angles
 
 __all__ = ["OF_RETURNS", "Pair", "Scan", "real_tensor"]
@@ -127,10 +128,25 @@ class Scan:
     def filled(self, norm_range: float = 0.0) -> torch.Tensor:
         """Returns what a network sees, (H, W) [m]: no return and ranges out of limits become `norm_range`.
 
+        Holes are bridged: they would be walls at `norm_range` in the middle of a surface.
+
         Args:
             norm_range: The range that the network was trained with [m]; the sensor's is taken where it is larger.
         """
-        return self.ranges.where(self.sensor.sees(self.ranges), max(norm_range, self.sensor.norm_range))
+        ranges = self.bridged().ranges
+        return ranges.where(self.sensor.sees(ranges), max(norm_range, self.sensor.norm_range))
+
+    def bridged(self) -> "Scan":
+        """Returns the scan as if the sensor had looked everywhere: holes filled from around them; see `holes.bridge`.
+
+        Ranges out of the limits of the sensor count as no return, if there is a hole.
+        """
+        if self.seen is None:
+            return self
+        names = [name for name in OF_RETURNS if getattr(self, name) is not None]
+        ranges = self.ranges.where(self.sensor.sees(self.ranges), 0.0)
+        ranges, *others = holes.bridge(ranges, self.seen, self.sensor, *(getattr(self, name) for name in names))
+        return Scan(ranges, self.sensor, **dict(zip(names, others, strict=True)))
 
     def decimate(self, rows: int | None = None, columns: int | None = None) -> "Scan":
         """Returns the scan of only some beams and columns; see `Sensor.decimation`."""
@@ -166,7 +182,8 @@ class Scan:
         """Returns the range image of a point cloud.
 
         Each point goes to its nearest pixel. Of several points in one pixel, the nearest to the sensor stays. Points
-        that are out of view, not finite or at the origin are dropped.
+        that are out of view, not finite or at the origin are dropped. An empty pixel is a no return, or was never
+        looked at: see `holes.find`.
 
         Args:
             points: (N, 3 or more) [m], in the sensor frame; columns after x, y, z are ignored.
@@ -206,12 +223,9 @@ class Scan:
                 f"none of {len(points)} points ({len(usable)} finite and off the origin) is in view of {sensor}: "
                 "give the sensor that measured them, and points in metres in its frame"
             )
-        kept = usable[in_view]
+        kept, pixels = usable[in_view], pixels[in_view]
         height, width = sensor.shape
-        row, column = pixels[in_view].round().long().unbind(-1)
-        row = row.clamp(0, height - 1)
-        column = column.remainder(width) if sensor.wrap else column.clamp(0, width - 1)
-        pixel, distance = row * width + column, distance[kept].float()
+        pixel, distance = holes.nearest_pixels(pixels, sensor), distance[kept].float()
         ranges = torch.full((height * width,), torch.inf, device=points.device)
         ranges.scatter_reduce_(0, pixel, distance, "amin")
         stays = distance == ranges[pixel]  # of equally near points, the one with the larger value
@@ -221,7 +235,8 @@ class Scan:
             .view(sensor.shape)
             for name, values in of_points.items()
         }
-        return cls(ranges.masked_fill(ranges.isinf(), 0.0).view(sensor.shape), sensor, **images)
+        ranges = ranges.masked_fill(ranges.isinf(), 0.0).view(sensor.shape)
+        return cls(ranges, sensor, **images, seen=~holes.find(pixels, sensor))
 
 
 # The scan that a model sees, and the scan that it should predict.

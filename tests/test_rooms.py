@@ -17,7 +17,7 @@ FLOORS = [
     {"ilnet.models", "ilnet.world"},
     {"ilnet.scan_files"},
     {"ilnet.scan"},
-    {"ilnet.sensor_files"},
+    {"ilnet.holes", "ilnet.sensor_files"},
     {"ilnet.sensor"},
     {"ilnet.sensors"},
     {"ilnet.memory"},

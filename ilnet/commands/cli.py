@@ -167,11 +167,24 @@ def train(
 @click.option(
     "--sensor", metavar="NAME|FILE", help="Preset or table with the scan's angles, if the file does not hold them."
 )
-@click.option("--size", type=_Size(), help="Rays to predict in the scene; 128x2048 by default.")
+@click.option(
+    "--data",
+    type=Path,
+    metavar="DIR",
+    help="Measure on stored scans: an archive, or a tree of .rimg files by the paper's authors.",
+)
+@click.option(
+    "--input", "source", type=_Size(), help="Size of the stored scans to predict from; the smallest by default."
+)
+@click.option(
+    "--size",
+    type=_Size(),
+    help="Rays to predict: of the scene, 128x2048 by default; of stored scans, each other size by default.",
+)
 @click.option(
     "--scans",
     type=click.IntRange(min=1),
-    help="Scans of the scene; by default 8 of a town, or all positions in a mesh.",
+    help="Scans of the scene or of the stored ones; by default 8 of a town, or all.",
 )
 @click.option(
     "--protocol", type=click.Choice(["kitti"]), help="Measure KITTI's files FILES, or those in folders, as others do."
@@ -187,27 +200,44 @@ def evaluate(
     measured: tuple[Path, ...],
     rows: int | None,
     sensor: str | None,
+    data: Path | None,
+    source: tuple[int, int] | None,
     size: tuple[int, int] | None,
     scans: int | None,
     protocol: str | None,
     as_json: bool,
 ) -> None:
-    """Measure models on scans of a scene, seen with 16x1024 rays, on measured scans, or by a protocol on FILES."""
-    if [bool(scene), bool(measured), bool(protocol)].count(True) != 1:
-        raise click.UsageError("give --scene TOWN|MESH, --scan FILE or --protocol kitti FILE")
+    """Measure models on scans of a scene, seen with 16x1024 rays, on measured or stored scans, or by a protocol."""
+    if [bool(scene), bool(measured), bool(data), bool(protocol)].count(True) != 1:
+        raise click.UsageError("give --scene TOWN|MESH, --scan FILE, --data DIR or --protocol kitti FILE")
     if bool(protocol) != bool(files):
         raise click.UsageError("--protocol kitti and FILES go together; --scan FILE names other scans")
-    if not scene and (at or size or scans):
-        raise click.UsageError("--at, --size and --scans go with --scene; a scan is judged at its own size")
+    if not (scene or data) and (size or scans):
+        raise click.UsageError("--size and --scans go with --scene or --data; a scan is judged at its own size")
+    if (at and not scene) or (source and not data):
+        raise click.UsageError("--at goes with --scene, and --input with --data")
     if not measured and (rows is not None or sensor is not None):
         raise click.UsageError("--rows and --sensor go with --scan FILE")
     from ilnet import models, scan_files
     from ilnet.learning import evaluate
+    from ilnet.sensor import format_size
     from ilnet.world import simulate
 
     loaded = {name: models.load(name).to(simulate.best_device()) for name in names}
     if protocol:
         _evaluate_kitti(loaded, files, as_json)
+        return
+    pairs: Any
+    if data:
+        seen, wanted = (None if shape is None else format_size(shape) for shape in (source, size))
+        stored = evaluate.stored_pairs(data, seen, wanted, scans)
+        found = [(evaluate.summary(evaluate.scan_by_scan(loaded, pairs), pairs), pairs) for pairs in stored]
+        if as_json:
+            every = [result for results, _ in found for result in results]
+            click.echo(_json(every[0] if len(every) == 1 else every))
+            return
+        for results, pairs in found:
+            _echo_figures(f"{data}: {len(pairs)} scan(s) of {pairs.sizes[0]}", results, pairs)
         return
     if measured:
         pairs = [_scan_pair(path, rows, sensor) for named in measured for path in scan_files.listed(named)]
@@ -218,10 +248,18 @@ def evaluate(
     if as_json:
         click.echo(_json(results[0] if len(results) == 1 else results))
         return
-    click.echo(f"{scene or ', '.join(map(str, measured))}: {len(pairs)} scan(s) -> {results[0]['size']}\n")
+    _echo_figures(f"{scene or ', '.join(map(str, measured))}: {len(pairs)} scan(s)", results, pairs)
+
+
+def _echo_figures(title: str, results: list[dict[str, Any]], pairs: Any) -> None:
+    click.echo(f"{title} -> {results[0]['size']}\n")
     click.echo(_table({result["model"]: result for result in results}))
     if len(pairs) > 1:
         click.echo("\n" + "\n".join(_intervals(results)))
+    if unseen := results[0]["unseen"]:
+        count = sum(truth.ranges.numel() for _, truth in pairs)
+        click.echo(f"\n{unseen} of {count} pixels are left out: the sensor never looked there.")
+    click.echo()
 
 
 def _scene_pairs(scene: str, at: Path | None, size: tuple[int, int] | None, scans: int | None) -> list[Any]:
@@ -259,7 +297,11 @@ def _evaluate_kitti(loaded: dict[str, Any], files: tuple[Path, ...], as_json: bo
             found = result.get(kind, result)
             click.echo(f"{result['model']:18}" + "".join(f"{found[key]:11.3f}" for key in ("mae", "iou", "chamfer")))
         click.echo("")
-    click.echo(f"Means over {results[0]['scans']} file(s); --json has each.")
+    unseen = [f"{results[0][f'{kind} unmeasured']['unseen']:.0f} of {kind}" for kind in kitti.PROJECTIONS]
+    click.echo(
+        f"Means over {results[0]['scans']} file(s); --json has each. Of unmeasured rows, pixels that no ray went to "
+        f"are left out: {' and '.join(unseen)} a file."
+    )
 
 
 def _intervals(results: list[dict[str, Any]]) -> list[str]:
@@ -595,12 +637,24 @@ def towns(names: tuple[str, ...], out: Path) -> None:
     show_default=True,
     help="Folder for weights, numbers and figures.",
 )
-@click.option("--scans", type=click.IntRange(min=1), default=20, show_default=True, help="Scans from each test town.")
+@click.option(
+    "--scans", type=click.IntRange(min=1), help="Scans from each test town, 20 by default; of a tree, all by default."
+)
 @click.option(
     "--seeds", type=click.IntRange(min=1), default=3, show_default=True, help="Trainings for each band of a curve."
 )
 @click.option(
-    "--data", type=Path, metavar="DIR", help="Stored images: for LiDAR-SR, and to compare with continuous rays."
+    "--data",
+    type=Path,
+    metavar="DIR",
+    help="Stored images: for LiDAR-SR, and to compare with continuous rays. On a tree of .rimg files, table measures.",
+)
+@click.option(
+    "--model",
+    "models",
+    multiple=True,
+    metavar="NAME|FILE",
+    help="A model for the table of a tree; may be repeated. By default the rules and the networks that ship.",
 )
 @click.option(
     "--measured",
@@ -613,9 +667,10 @@ def experiment(
     names: tuple[str, ...],
     preset: str | None,
     out: Path,
-    scans: int,
+    scans: int | None,
     seeds: int,
     data: Path | None,
+    models: tuple[str, ...],
     measured: tuple[Path, ...],
 ) -> None:
     """Run the paper's experiments and ours: CSV, figures, RESULTS.md. An interrupted run goes on where it stopped."""
@@ -631,7 +686,7 @@ def experiment(
         if name in chosen and not value:  # said before hours of training, not after
             raise click.UsageError(f"{name} needs {option}")
     files = tuple(path for named in measured for path in scan_files.listed(named))
-    study = Study(preset, out, scans, seeds, data, files)
+    study = Study(preset, out, scans or 20, seeds, data, files, models, scans)
     for name in chosen:
         study.run(name, experiment.EXPERIMENTS[name])
         click.echo(experiment.results(study))

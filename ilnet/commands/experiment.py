@@ -51,10 +51,16 @@ _CONVERGING = {"liif": "--", "iln": "-", "iln-surfaces": "-."}
 
 
 def table(study: Study) -> None:
-    """The paper's Table II: all methods at three sizes."""
+    """The paper's Table II: all methods at three sizes; on a tree of the paper's authors, at each of its sizes."""
     rules: dict[str, str | Path] = {name: name for name in ("nearest", "bilinear", "bilinear-inverse", "planes")}
+    archive = data.open_archive(study.archive) if study.archive else None
+    if isinstance(archive, data.RangeImageTree):
+        _table_of_tree(study, archive.path, {name: name for name in study.named} or rules | study.networks())
+        return
+    if study.named:
+        raise ValueError("models are named; that goes with a tree of .rimg files")
     networks = study.networks()
-    stored = data.open_archive(study.archive).sensors if study.archive else {}
+    stored = archive.sensors if archive else {}
     methods, rows = {}, []
     for size in study.sizes:
         lidar_sr = {}
@@ -66,18 +72,34 @@ def table(study: Study) -> None:
             card = models.card(methods[size][row["model"]])
             rows.append(row | {key: card.get(key, "") for key in ("steps", "minutes")})
     study.write("table", rows)
+    _draw_table(study, rows)
+    _draw_points(study, study.sizes[1], methods[study.sizes[1]])
+
+
+def _table_of_tree(study: Study, tree: Path, files: Mapping[str, str | Path]) -> None:
+    compared, rows = loaded(files), []
+    for pairs in evaluate.stored_pairs(tree, count=study.stored_scans):
+        for row in evaluate.measure(compared, pairs):
+            # A checkpoint of the authors has no card.
+            about = {} if str(row["model"]).endswith(".pth") else models.card(files[row["model"]])
+            rows.append(row | {key: about.get(key, "") for key in ("steps", "minutes")})
+    study.write("table", rows)
+    _draw_table(study, rows)
+
+
+def _draw_table(study: Study, rows: Sequence[dict[str, Any]]) -> None:
     figure = Figure(figsize=(10, 3.2), layout="constrained")
-    for axis, (name, paper) in zip(figure.subplots(1, len(study.sizes), sharey=True), PAPER.items(), strict=True):
+    sizes = list(dict.fromkeys(row["size"] for row in rows))
+    for axis, name in zip(figure.subplots(1, len(sizes), sharey=True, squeeze=False)[0], sizes, strict=True):
         found = {row["model"]: row["iou"] for row in rows if row["size"] == name}
         axis.bar(list(found), list(found.values()), color=[COLOURS.get(name, "#cccccc") for name in found])
-        theirs = {model: figures[1] for model, figures in paper.items() if model in found}
+        theirs = {model: figures[1] for model, figures in PAPER.get(name, {}).items() if model in found}
         axis.plot(list(theirs), list(theirs.values()), "k_", markersize=18, label="the paper, on CARLA")
         axis.set_title(name)
         axis.tick_params("x", rotation=60, labelsize=8)
     axis.legend(fontsize=8)
     figure.axes[0].set_ylabel("IoU")
     figure.savefig(study.out / "table.png", dpi=120)
-    _draw_points(study, study.sizes[1], methods[study.sizes[1]])
 
 
 def _draw_points(study: Study, size: tuple[int, int], files: Mapping[str, str | Path]) -> None:
@@ -268,7 +290,8 @@ def results(study: Study) -> Path:
             lines += ["", f"### {part}", "", f"![{part}]({part}.png)", ""]
             lines += _markdown(_read(study.out / f"{part}.csv"))
         if name == "table":
-            lines += ["", *(f"![The same crop by every method, {town}](points-{town}.png)" for town in towns.TEST)]
+            drawn = [town for town in towns.TEST if (study.out / f"points-{town}.png").exists()]
+            lines += ["", *(f"![The same crop by every method, {town}](points-{town}.png)" for town in drawn)]
     page = study.out / "RESULTS.md"
     page.write_text("\n".join(lines).rstrip() + "\n")
     return page
@@ -342,7 +365,7 @@ def _beside_the_paper(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     """Returns the rows with the paper's MAE and IoU, where it reports them."""
     found = []
     for row in rows:
-        theirs = PAPER[row["size"]].get(row["model"])
+        theirs = PAPER.get(row["size"], {}).get(row["model"])
         found.append({**row, "mae, paper": theirs[0] if theirs else "", "iou, paper": theirs[1] if theirs else ""})
     return found
 

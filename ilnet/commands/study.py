@@ -52,6 +52,8 @@ class Study:
         archive: Stored images, to compare with continuous rays and to train LiDAR-SR at those of `sizes` that it holds.
             If None, both are left out.
         measured: Files of measured scans. Their names without suffix differ, since results bear them.
+        named: Models of the table of a tree of `.rimg` files; if there is none, those of the other table.
+        stored_scans: Number of its scans; None for all.
         used: Files of the networks that were trained for an experiment, in this run or before.
         sizes: Sizes that are predicted, those of the paper.
 
@@ -65,6 +67,8 @@ class Study:
     seeds: int = 3
     archive: Path | None = None
     measured: tuple[Path, ...] = ()
+    named: tuple[str, ...] = ()
+    stored_scans: int | None = None
     used: set[Path] = field(default_factory=set, init=False, repr=False)
     sizes: ClassVar[Sequence[tuple[int, int]]] = ((64, 1024), (128, 2048), (256, 4096))
 
@@ -154,6 +158,7 @@ class Study:
         options = [f"--scans {self.scans}", f"--seeds {self.seeds}"]
         options += [f"--preset {self.preset}"] if self.preset else []
         options += ["--data DIR"] if self.archive else []
+        options += [f"--model {model}" for model in self.named]
         options += ["--measured FILE ..."] if self.measured else []
         command = f"python -m ilnet experiment {name} {' '.join(options)}"
         about = {"command": command, "commit": _commit(), "minutes": round((time.monotonic() - begun) / 60, 1)}

@@ -19,7 +19,7 @@ import json
 import math
 import os
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -123,11 +123,17 @@ class Archive:
             OSError: If this scan is not there (yet).
             ValueError: If there is no such size, or the scan's file is damaged.
         """
-        if size not in self.sensors:
-            raise ValueError(f"{self.path}: holds no scans of size {size!r}; it has {', '.join(self.sizes)}")
+        self._check_size(size)
         counts = self._read(f"range_{size}", number)
         scale = self._arrays[f"range_{size}"].attrs["scale_factor"]
         return Scan(torch.from_numpy(counts.astype(np.float32)) * scale, self.sensors[size])
+
+    def check(self, sizes: Sequence[str], numbers: Sequence[int]) -> None:
+        """Raises what `scan` would if a scan of these numbers lacked one of the sizes, without reading any."""
+        for size in sizes:
+            self._check_size(size)
+            for number in numbers:
+                self._check_there(f"range_{size}", number)
 
     def pose(self, number: int) -> torch.Tensor:
         """Returns the pose (4, 4) float64 of a scan, from the sensor frame to the world [m]; raises as `scan` does."""
@@ -137,7 +143,11 @@ class Archive:
         """Returns the name of the place where a scan was taken, one of `towns`; raises as `scan` does."""
         return self.towns[self._read("town", number)]
 
-    def _read(self, name: str, number: int) -> Any:
+    def _check_size(self, size: str) -> None:
+        if size not in self.sensors:
+            raise ValueError(f"{self.path}: holds no scans of size {size!r}; it has {', '.join(self.sizes)}")
+
+    def _check_there(self, name: str, number: int) -> Path:
         if not 0 <= number < len(self):
             raise IndexError(f"{self.path}: there is no scan {number}; its {len(self)} scans are numbered from 0")
         file = self._file(name, number // UNIT)
@@ -145,6 +155,10 @@ class Archive:
             raise FileNotFoundError(
                 f"{self.path}: scan {number} is not there yet; run the command that makes the archive to its end"
             )
+        return file
+
+    def _read(self, name: str, number: int) -> Any:
+        file = self._check_there(name, number)
         try:
             return self._arrays[name][number]
         except Exception as error:  # zarr and its codecs raise many kinds on damaged files

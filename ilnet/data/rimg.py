@@ -12,6 +12,7 @@ In the frame of `ilnet.sensor` the azimuth is π/2 - h, so that points have the 
 
 import math
 import re
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -100,12 +101,9 @@ class RangeImageTree:
             OSError: If there is no such size of this scan.
             ValueError: If the file is cut short or damaged.
         """
-        if size not in self.sensors:
-            raise ValueError(f"{self.path}: holds no scans of size {size!r}; it has {', '.join(self.sizes)}")
-        _, index, folder = self._numbered(number)
-        sensor = self.sensors[size]
+        self._check_size(size)
+        file, sensor = self._file(number, size), self.sensors[size]
         rows, columns = sensor.shape
-        file = folder / f"{rows}_{columns}" / f"{index}.rimg"
         if not file.is_file():
             raise FileNotFoundError(f"{file}: there is no such file, though other sizes of this scan are there")
         content = file.read_bytes()
@@ -121,6 +119,17 @@ class RangeImageTree:
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from None
 
+    def check(self, sizes: Sequence[str], numbers: Sequence[int]) -> None:
+        """Raises what `scan` would if a scan of these numbers lacked one of the sizes, without reading any."""
+        for size in sizes:
+            self._check_size(size)
+            lacking = [file for file in (self._file(number, size) for number in numbers) if not file.is_file()]
+            if lacking:
+                raise FileNotFoundError(
+                    f"{self.path}: {len(lacking)} of {len(numbers)} scans have no {size}, such as {lacking[0]}; each "
+                    f"should be there in {' and '.join(sizes)}: copy them, or name the folder of another town"
+                )
+
     def pose(self, number: int) -> torch.Tensor:
         """Raises a ValueError: the authors' files do not hold the poses of scans."""
         raise ValueError(f"{self.path}: .rimg files hold no poses; only archives do")
@@ -128,6 +137,14 @@ class RangeImageTree:
     def town(self, number: int) -> str:
         """Returns the name of the town where a scan was taken, one of `towns`."""
         return self._numbered(number)[0]
+
+    def _check_size(self, size: str) -> None:
+        if size not in self.sensors:
+            raise ValueError(f"{self.path}: holds no scans of size {size!r}; it has {', '.join(self.sizes)}")
+
+    def _file(self, number: int, size: str) -> Path:
+        _, index, folder = self._numbered(number)
+        return folder / size.replace("x", "_") / f"{index}.rimg"
 
     def _numbered(self, number: int) -> tuple[str, int, Path]:
         if not 0 <= number < len(self):

@@ -12,13 +12,24 @@ import numpy as np
 from scipy import stats
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from ilnet import models, scan_files, sensor_files
+from ilnet import data, models, scan_files, sensor_files
+from ilnet.data import Archive, RangeImageTree
 from ilnet.learning import metrics
 from ilnet.scan import Pair
-from ilnet.sensor import PAPER_INPUT, Sensor
+from ilnet.sensor import PAPER_INPUT, Sensor, parse_size
 from ilnet.world import places, simulate
 
-__all__ = ["interval", "measure", "mesh_pairs", "scan_by_scan", "scan_pair", "summary", "town_pairs"]
+__all__ = [
+    "StoredPairs",
+    "interval",
+    "measure",
+    "mesh_pairs",
+    "scan_by_scan",
+    "scan_pair",
+    "stored_pairs",
+    "summary",
+    "town_pairs",
+]
 
 # The figures of the paper, and those that tell whether edges stay sharp.
 _FIGURES = ("mae", "iou", "precision", "recall", "f1", "floating", "edge_mae", "chamfer")
@@ -100,6 +111,71 @@ def scan_pair(path: Path, rows: int, sensor: str | None = None) -> Pair:
     return scan, truth
 
 
+class StoredPairs(Sequence[Pair]):
+    """Scans of one size on disk, each with that of another size from the same place; read when they are asked for.
+
+    Args:
+        stored: The scans.
+        source: The size that a model sees, such as "16x1024".
+        output: The size that it should predict.
+        numbers: Which scans; all by default.
+
+    Raises:
+        OSError: If one of them lacks a size.
+        ValueError: If there is no such size.
+    """
+
+    def __init__(
+        self, stored: Archive | RangeImageTree, source: str, output: str, numbers: Sequence[int] | None = None
+    ):
+        self.stored, self.sizes = stored, (source, output)
+        self.numbers = range(len(stored)) if numbers is None else numbers
+        self.device = simulate.best_device()
+        stored.check(self.sizes, self.numbers)
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Returns a pair; for a slice, `StoredPairs`."""
+        if isinstance(index, slice):
+            return StoredPairs(self.stored, *self.sizes, self.numbers[index])
+        scan, truth = (self.stored.scan(self.numbers[index], size).to(self.device) for size in self.sizes)
+        return scan, truth
+
+
+def stored_pairs(
+    path: Path, source: str | None = None, output: str | None = None, count: int | None = None
+) -> list[StoredPairs]:
+    """Returns the scans in an archive, or in a tree of the paper's authors, as pairs for each size to predict.
+
+    Args:
+        path: Its folder; see `data.open_archive`.
+        source: The size that a model sees, such as "16x1024"; by default that with the fewest rays.
+        output: The size to predict; by default each other one, by its number of rays.
+        count: Number of scans, evenly spread over all; all by default.
+
+    Raises:
+        OSError: If there is nothing of the kind, or a scan lacks a size.
+        ValueError: If there are not two sizes, no such size, or fewer scans than `count`.
+    """
+    stored = data.open_archive(path)
+    sizes = sorted(stored.sizes, key=lambda size: math.prod(parse_size(size)))
+    if len(sizes) < 2:
+        raise ValueError(
+            f"{path}: holds scans of {', '.join(sizes)} only; it should hold two sizes, one to predict from and one to "
+            "predict"
+        )
+    source = source or sizes[0]
+    if source == output:
+        raise ValueError(f"the sizes to predict from and to predict are both {source}; they should differ")
+    if count is not None and count > len(stored):
+        raise ValueError(f"{path}: holds {len(stored)} scans; it should hold the {count} that are asked for")
+    numbers = None if count is None else np.linspace(0, len(stored), count, endpoint=False).astype(int).tolist()
+    outputs = [output] if output else [size for size in sizes if size != source]
+    return [StoredPairs(stored, source, size, numbers) for size in outputs]
+
+
 def measure(loaded: Mapping[str, models.Model], pairs: Sequence[Pair]) -> list[dict[str, Any]]:
     """Measures models, with a progress bar on stderr.
 
@@ -121,19 +197,19 @@ def measure(loaded: Mapping[str, models.Model], pairs: Sequence[Pair]) -> list[d
 
 def scan_by_scan(loaded: Mapping[str, models.Model], pairs: Sequence[Pair]) -> dict[str, list[dict[str, float]]]:
     """Returns for each model the figures of each pair; arguments, figures and errors are those of `measure`."""
-    device = pairs[0][0].ranges.device
-    clouds = [metrics.cloud(truth.ranges, truth.sensor) for _, truth in pairs]
-    results: dict[str, list[dict[str, float]]] = {}
+    results: dict[str, list[dict[str, float]]] = {name: [] for name in loaded}
+    kept: dict[str, models.Upsampler] = {}
     with tqdm(total=len(loaded) * len(pairs), unit="scan", desc="evaluate") as progress:
-        for name, model in loaded.items():
-            frames: models.Upsampler | None = None
-            results[name] = []
-            for (sparse, dense), cloud in zip(pairs, clouds, strict=True):
+        for sparse, dense in pairs:
+            cloud = metrics.cloud(dense.ranges, dense.sensor)
+            for name, model in loaded.items():
+                frames = kept.get(name)
                 if frames is None or (frames.source, frames.target) != (sparse.sensor, dense.sensor):
-                    frames = models.Upsampler(model, sparse.sensor, dense.sensor, device=device)
+                    frames = models.Upsampler(model, sparse.sensor, dense.sensor, device=sparse.ranges.device)
+                    kept[name] = frames
                 ranges = frames.ranges(sparse)
                 figures = metrics.compare(ranges, dense)
-                figures["chamfer"] = metrics.chamfer(metrics.cloud(ranges, dense.sensor), cloud)
+                figures["chamfer"] = metrics.chamfer(metrics.cloud(metrics.judged(ranges, dense), dense.sensor), cloud)
                 results[name].append({figure: figures[figure] for figure in _FIGURES})
                 progress.update()
     return results
@@ -142,14 +218,16 @@ def scan_by_scan(loaded: Mapping[str, models.Model], pairs: Sequence[Pair]) -> d
 def summary(figures: Mapping[str, Sequence[Mapping[str, float]]], pairs: Sequence[Pair]) -> list[dict[str, Any]]:
     """Returns what `measure` does, and how sure it is, given what `scan_by_scan` returned for these pairs.
 
-    Of two scans or more, `iou_interval` and `mae_interval` are 95 % intervals of the means. `iou_difference` and
+    `unseen` is the number of pixels in all scans that were never looked at, and so are left out of all figures. Of two
+    scans or more, `iou_interval` and `mae_interval` are 95 % intervals of the means. `iou_difference` and
     `mae_difference` are the mean differences from the first model, scan by scan, and `iou_difference_interval` and
     `mae_difference_interval` their intervals: a model is ahead in IoU where the whole interval is above 0.
     """
     results = []
+    unseen = sum(0 if truth.seen is None else int((~truth.seen).sum()) for _, truth in pairs)
     first = next(iter(figures.values()))
     for name, found in figures.items():
-        result = _means(name, found, pairs)
+        result = _means(name, found, pairs) | {"unseen": unseen}
         for key in ("iou", "mae") if len(pairs) > 1 else ():
             result[f"{key}_interval"] = interval([scan[key] for scan in found])
             if found is not first:

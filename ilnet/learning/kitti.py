@@ -11,12 +11,14 @@ Each projection is judged by two conventions:
   pasted into the prediction. IoU and Chamfer distance compare the point clouds of all pixels, of which the empty ones
   lie at the origin. The Chamfer distance is the sum of both means of squared distances [m²].
 - Ours. Only the rows that were not measured count, and no empty pixel is a point. The MAE [m] is over the pixels that
-  hold a return. The Chamfer distance is that of `metrics.chamfer` [m].
+  hold a return. The Chamfer distance is that of `metrics.chamfer` [m]. Pixels that no ray went to (`holes.find`) count
+  as neither return nor no return, and are bridged in what a model sees. To the literature they are empty pixels.
 
 Source: the published code of TULIP (CVPR 2024). It divides ranges by 80 before the MAE; here they stay metres.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,7 @@ import torch
 from scipy.spatial import KDTree
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from ilnet import models, scan_files
+from ilnet import holes, models, scan_files
 from ilnet.learning import metrics
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, preset
@@ -89,7 +91,7 @@ def _points(path: Path) -> np.ndarray:
 
 
 def project(points: np.ndarray, projection: str) -> Scan:
-    """Returns the range image of points.
+    """Returns the range image of points, with the pixels that no ray went to.
 
     Args:
         points: (N, 3) metres, in the sensor frame, in the order of the file.
@@ -105,15 +107,17 @@ def project(points: np.ndarray, projection: str) -> Scan:
     distance = np.linalg.norm(points, axis=1)
     points, distance = points[distance > 0], distance[distance > 0]
     elevation = np.rad2deg(np.arcsin(points[:, 2] / distance))
-    row = np.round((elevation + 24.8) * (_ROWS - 1) / 26.8).astype(int)
     turn = (np.arctan2(points[:, 1], points[:, 0]) + np.pi) / (2 * np.pi)
-    column = np.round(turn * _COLUMNS).astype(int) % _COLUMNS
+    pixels = np.stack(((elevation + 24.8) * (_ROWS - 1) / 26.8, turn * _COLUMNS % _COLUMNS), axis=1)
+    row, column = np.round(pixels).astype(int).T
+    column %= _COLUMNS
     seen = (row >= 0) & (row < _ROWS) & (distance <= sensor.max_range)
     if not seen.any():
         raise ValueError(f"none of {len(points)} points is in view; they should be metres in the LiDAR's frame")
     ranges = np.zeros(sensor.shape, np.float32)
     ranges[row[seen], column[seen]] = distance[seen]  # of several points in one pixel, numpy keeps the last
-    return Scan(torch.from_numpy(ranges), sensor)
+    unseen = holes.find(torch.from_numpy(pixels[seen]).float(), sensor) & (torch.from_numpy(ranges) == 0)
+    return Scan(torch.from_numpy(ranges), sensor, seen=~unseen)
 
 
 def conventional(ranges: torch.Tensor, truth: Scan) -> dict[str, float]:
@@ -144,19 +148,21 @@ def unmeasured(ranges: torch.Tensor, truth: Scan) -> dict[str, float]:
     """Measures a prediction by our convention: arguments as in `conventional`.
 
     Returns:
-        `mae` [m], `iou` and `chamfer` [m], as described above; `mae` is NaN where no pixel holds a return.
+        `mae` [m], `iou` and `chamfer` [m], as described above; `mae` is NaN where no pixel holds a return. `unseen` is
+        the number of pixels left out, since no ray went there.
     """
     rest = torch.ones(len(ranges), dtype=torch.bool, device=ranges.device)
     rest[::_STEP] = False
     hidden = Scan(truth.ranges.where(rest[:, None], 0.0), truth.sensor)
     returned = hidden.ranges > 0
-    predicted = Scan(ranges.where(rest[:, None], 0.0), truth.sensor).points()
+    predicted = Scan(metrics.judged(ranges, truth).where(rest[:, None], 0.0), truth.sensor).points()
     occupied = metrics.voxels(predicted), metrics.voxels(hidden.points())
     both = int(torch.isin(*occupied, assume_unique=True).sum())
     return {
         "mae": (ranges - truth.ranges)[returned].abs().mean().item(),
         "iou": both / max(len(occupied[0]) + len(occupied[1]) - both, 1),
         "chamfer": metrics.chamfer(predicted, hidden.points()),
+        "unseen": 0 if truth.seen is None else int((~truth.seen)[rest].sum()),
     }
 
 
@@ -169,7 +175,8 @@ def judge(loaded: Mapping[str, models.Model], paths: Sequence[Path]) -> list[dic
 
     Returns:
         For each model its name as `model`, the number of `scans`, and means over them: `mae`, `iou` and `chamfer` of
-        the spherical projection by the literature's convention, and the same keys in dicts for the other `TITLES`.
+        the spherical projection by the literature's convention, and the same keys in dicts for the other `TITLES`,
+        with `unseen` where only unmeasured rows count.
         `files` has all of these for each file.
 
     Raises:
@@ -189,9 +196,10 @@ def judge(loaded: Mapping[str, models.Model], paths: Sequence[Path]) -> list[dic
                     sparse = _every_fourth(truth)
                     if (name, kind) not in frames:
                         frames[name, kind] = models.Upsampler(model, sparse.sensor, truth.sensor, device=device)
-                    ranges = frames[name, kind].ranges(sparse)
-                    ranges = ranges.where(ranges <= truth.sensor.max_range, 0.0)
+                    # The literature knows no holes, neither in what a model sees nor in what it should predict.
+                    ranges = _answered(frames[name, kind], replace(sparse, seen=None))
                     found[kind] = conventional(ranges, truth)
+                    ranges = ranges if sparse.seen is None else _answered(frames[name, kind], sparse)
                     found[f"{kind} unmeasured"] = unmeasured(ranges, truth)
                 rows[name].append(found)
                 progress.update()
@@ -201,7 +209,12 @@ def judge(loaded: Mapping[str, models.Model], paths: Sequence[Path]) -> list[dic
 def _every_fourth(truth: Scan) -> Scan:
     sensor = truth.sensor
     kept = Sensor(sensor.elevations[::_STEP], sensor.azimuths, sensor.min_range, sensor.max_range, sensor.norm_range)
-    return Scan(truth.ranges[::_STEP], kept)
+    return Scan(truth.ranges[::_STEP], kept, seen=None if truth.seen is None else truth.seen[::_STEP])
+
+
+def _answered(frames: models.Upsampler, sparse: Scan) -> torch.Tensor:
+    ranges = frames.ranges(sparse)
+    return ranges.where(ranges <= frames.target.max_range, 0.0)
 
 
 def _summary(name: str, found: list[dict[str, Any]]) -> dict[str, Any]:

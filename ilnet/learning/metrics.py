@@ -10,7 +10,7 @@ from torchmetrics import Metric
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 
-__all__ = ["FIGURES", "VOXEL", "ScanMetrics", "chamfer", "cloud", "compare", "edges", "floating", "voxels"]
+__all__ = ["FIGURES", "VOXEL", "ScanMetrics", "chamfer", "cloud", "compare", "edges", "floating", "judged", "voxels"]
 
 FIGURES = ("mae", "iou", "precision", "recall", "f1", "floating", "edge_mae", "flat_mae")
 # Edge length of the voxels [m] (paper, Sec. III-B).
@@ -64,6 +64,14 @@ def cloud(ranges: torch.Tensor, sensor: Sensor) -> torch.Tensor:
     """Returns the points (N, 3) [m] of those ranges (H, W) [m] that lie within the limits of the sensor."""
     within = sensor.sees(ranges)
     return sensor.directions().to(ranges.device)[within] * ranges[within].unsqueeze(-1)
+
+
+def judged(ranges: torch.Tensor, truth: Scan) -> torch.Tensor:
+    """Returns predicted ranges (H, W) [m] without those at pixels of the true scan that were never looked at: 0 there.
+
+    What is there is unknown: a return would be no error, nor would a no return.
+    """
+    return ranges if truth.seen is None else ranges.where(truth.seen, 0.0)
 
 
 def _padded(image: torch.Tensor, wrap: bool) -> torch.Tensor:
@@ -162,7 +170,9 @@ def compare(ranges: torch.Tensor, truth: Scan) -> dict[str, float]:
         truth: The true scan, by the sensor of the prediction.
 
     Returns:
-        The `FIGURES`, each 0 where it is undefined:
+        The `FIGURES`, each 0 where it is undefined: a prediction without a return has a precision, an IoU and an F1 of
+        0, as all its voxels are missing. The authors' code has NaN there, and so in the mean over scans. Pixels where
+        the sensor of `truth` never looked are left out:
         mae: Mean absolute error [m] over all pixels; no return counts as `norm_range`.
         iou, precision, recall, f1: Figures of the occupied voxels of 0.1 m, without ranges outside the sensor's limits.
         floating: Share of the predicted returns that float between two surfaces, see `floating`.
@@ -178,9 +188,11 @@ def compare(ranges: torch.Tensor, truth: Scan) -> dict[str, float]:
     if not ranges.isfinite().all():
         raise ValueError(f"ranges holds {int((~ranges.isfinite()).sum())} NaN or infinite values; all should be finite")
     far = truth.sensor.norm_range
-    ranges = ranges.where(ranges >= truth.sensor.min_range, far).clamp(max=far)
+    ranges = judged(ranges.where(ranges >= truth.sensor.min_range, far).clamp(max=far), truth)
     error, at_edge = (ranges - truth.filled()).abs(), edges(truth)
-    predicted, true = (voxels(cloud(image, truth.sensor)) for image in (ranges, truth.filled()))
+    if truth.seen is not None:
+        error, at_edge = error[truth.seen], at_edge[truth.seen]
+    predicted, true = (voxels(cloud(image, truth.sensor)) for image in (ranges, truth.ranges))
     common = int(torch.isin(predicted, true, assume_unique=True).sum())
     precision = common / max(len(predicted), 1)
     recall = common / max(len(true), 1)

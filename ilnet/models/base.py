@@ -176,9 +176,10 @@ class Model(nn.Module):
             precision: See `Upsampler`.
 
         Returns:
-            A scan of `sensor`. Rays outside the field of view of the scan's sensor, those predicted beyond the maximum
-            range of either, and those below the minimum range of `sensor`, hold no return. It has an intensity if
-            `scan` has one, and a confidence if the model tells it.
+            A scan of `sensor`. Holes of `scan` are bridged first (`Scan.bridged`), and answered like other pixels. Rays
+            outside the field of view of the scan's sensor, those predicted beyond the maximum range of either, and
+            those below the minimum range of `sensor`, hold no return. It has an intensity if `scan` has one, and a
+            confidence if the model tells it.
 
         Raises:
             ValueError: If the model is not on the scan's device, the precision is unknown, or the model cannot predict
@@ -238,15 +239,15 @@ class Upsampler:
         Raises:
             ValueError: If the scan is not one of the source sensor, or the scan or the model is on another device.
         """
-        return self._predict(scan, None).ranges.view(self.target.shape)
+        return self._predict(scan, bright=False).ranges.view(self.target.shape)
 
     def __call__(self, scan: Scan) -> Scan:
         """Predicts the target sensor's scan; see `Model.upsample`."""
-        frame = self._predict(scan, scan.intensity).map(lambda image: image.view(self.target.shape))
+        frame = self._predict(scan, bright=scan.intensity is not None).map(lambda image: image.view(self.target.shape))
         return _returns(frame, self._seen, self.source, self.target)
 
     @torch.no_grad()
-    def _predict(self, scan: Scan, intensity: torch.Tensor | None) -> "_Frame":
+    def _predict(self, scan: Scan, bright: bool) -> "_Frame":
         if scan.sensor != self.source:
             raise ValueError(f"scan is of {scan.sensor!r}; it should be of {self.source!r}, as this upsampler expects")
         if scan.ranges.device != self.device:
@@ -255,7 +256,10 @@ class Upsampler:
                 f"call scan.to('{self.device}')"
             )
         _check_device(self.model, self.device)
-        images = [scan.filled(self.model.norm_range)] + ([] if intensity is None else [intensity])
+        scan = scan.bridged()
+        images = [scan.filled(self.model.norm_range)]
+        if bright and scan.intensity is not None:
+            images.append(scan.intensity)
         images = [image.flip(self._flips).unsqueeze(0) for image in images]
         return self._replay(*images) if self.device.type == "cuda" else self._answer(*images)
 

@@ -222,3 +222,28 @@ def test_chamfer_distance_by_hand():
     assert chamfer(one, other) == chamfer(other, one)
     assert chamfer(one, one) == 0
     assert math.isnan(chamfer(one, one[:0]))
+
+
+def test_pixels_never_looked_at_are_left_out_of_all_figures():
+    sensor = step().sensor
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(sensor.shape, generator=generator) * 30 + 5
+    answer = truth + torch.rand(sensor.shape, generator=generator)
+    seen = torch.ones(sensor.shape, dtype=torch.bool)
+    seen[::2] = False
+    holed = Scan(truth.where(seen, 0.0), sensor, seen=seen)
+    figures = compare(answer, holed)
+    wild = answer.where(seen, 40.0 + 10 * torch.rand(sensor.shape, generator=generator))
+    assert compare(wild, holed) == figures
+    assert figures["mae"] == pytest.approx((answer - truth).abs()[seen].mean().item())
+    assert compare(truth, holed)["iou"] == compare(truth, holed)["precision"] == 1
+
+
+def test_a_prediction_without_returns_is_all_wrong_and_no_nan():
+    """The authors' code divides 0 by 0 here."""
+    truth = step()
+    figures = compare(torch.full(truth.ranges.shape, 100.0), truth)
+    assert {name: figures[name] for name in ("iou", "precision", "recall", "f1")} == dict.fromkeys(
+        ("iou", "precision", "recall", "f1"), 0.0
+    )
+    assert figures["mae"] == pytest.approx(85.0)
