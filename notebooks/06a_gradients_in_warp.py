@@ -148,7 +148,7 @@ assert torch.allclose(wp.to_torch(mount.grad), by_hand)
 # *adds* to the gradient of that input; where the kernel *writes* an output, the adjoint reads the gradient of that
 # output.
 #
-# The drawing on top is a *trace*: `trace_thread` replays one thread of the kernel in Python, on small arrays that note
+# The first drawing below is a *trace*: `trace_thread` replays one thread of the kernel in Python, on small arrays that note
 # what is read and written. You will use it on kernels of your own.
 
 # %% tags=["hide-input"]
