@@ -1,5 +1,6 @@
 """Recordings, which are bags and packet captures: their scans in order, made denser; `upsample` of a recording."""
 
+import logging
 import queue
 import sys
 import threading
@@ -75,7 +76,7 @@ def frames_of(
         found = (Frame(time, scan) for time, scan in captures.sweeps(source, sensor, metadata))
         yield found, Kind(topic or TOPIC)
         return
-    with bags.Bag(source) as bag:
+    with bags.Bag(source) as bag, _noted_once():
         name = bag.cloud_topic(topic)
         if sensor is None:
             raise ValueError(f"{source}: a cloud does not hold the angles of its rays; name its sensor: --from NAME")
@@ -89,7 +90,7 @@ def _clouds(bag: bags.Bag, topic: str, sensor: Sensor) -> Iterator[Frame]:
             continue
         cloud = bag.cloud(message)
         try:
-            yield Frame(message.time, cloud.scan(sensor), cloud, message)
+            yield Frame(message.time, cloud.scan(sensor, f"{bag.path}, {topic}"), cloud, message)
         except ValueError as error:
             yield Frame(message.time, message=message, problem=str(error))
 
@@ -230,6 +231,30 @@ def ahead(items: Iterable[_Item], count: int = 2) -> Iterator[_Item]:
     finally:
         over.set()
         thread.join()
+
+
+class _Once(logging.Filter):
+    """Lets each line through once: what is noted of one scan is true of all."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._said: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        line = record.getMessage()
+        new = line not in self._said
+        self._said.add(line)
+        return new
+
+
+@contextmanager
+def _noted_once() -> Iterator[None]:
+    once, logger = _Once(), logging.getLogger("ilnet")
+    logger.addFilter(once)
+    try:
+        yield
+    finally:
+        logger.removeFilter(once)
 
 
 def run(

@@ -13,6 +13,7 @@ import numpy as np
 
 from ilnet.scan import Scan
 from ilnet.scan_files import ouster
+from ilnet.scan_files.points import scan_of
 from ilnet.sensor import PRESETS, Sensor, preset
 
 __all__ = ["Decoder", "Sweep", "decoder", "is_capture", "packets", "sweeps"]
@@ -126,10 +127,9 @@ class _Velodyne:
             return None
         stamp, points = decoded
         assert self._sensor is not None
-        xyz = np.stack([points[axis] for axis in "xyz"], axis=1)
-        time = points["time"] - points["time"].min()
-        scan = Scan.from_points(xyz, self._sensor, np.clip(points["intensity"] / 255, 0, 1), time=time)
-        return Sweep(round(stamp.host * 1e9), scan)
+        columns = {name: points[name] for name in ("x", "y", "z", "ring", "time")}
+        columns["intensity"] = np.clip(points["intensity"] / 255, 0, 1)
+        return Sweep(round(stamp.host * 1e9), scan_of(columns, self._sensor, "packets"))
 
 
 class _Ouster:

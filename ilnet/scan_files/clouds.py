@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ilnet.scan import Scan
-from ilnet.scan_files.points import XYZ
+from ilnet.scan_files.points import XYZ, scan_of
 from ilnet.sensor import Sensor, directions_to_angles
 
 __all__ = ["TYPE", "Cloud", "pack"]
@@ -70,23 +70,28 @@ class Cloud:
     def _first(self, names: tuple[str, ...]) -> str | None:
         return next((name for name in names if name in (self.points.dtype.names or ())), None)
 
-    def scan(self, sensor: Sensor) -> Scan:
+    def scan(self, sensor: Sensor, source: str = "cloud") -> Scan:
         """Returns the range image of the points, with an intensity where they have one.
 
-        The intensity is divided by the largest that its type can hold or, if it is a float, by the smallest of 1, 255,
-        65535 and the largest of the cloud that is not below it.
+        The row of a point is that of its ring, where there is one. The intensity is divided by the largest that its
+        type can hold or, if it is a float, by the smallest of 1, 255, 65535 and the largest of the cloud that is not
+        below it.
 
         Args:
             sensor: The sensor that measured them.
+            source: What the points are called in notes.
 
         Raises:
             ValueError: If no point is in view of the sensor.
         """
-        intensity = None
+        columns = dict(zip(XYZ, self._xyz().T, strict=True))
+        ring = self._first(_RINGS)
+        if ring:
+            columns["ring"] = self.points[ring]
         if "intensity" in (self.points.dtype.names or ()):
             values = np.nan_to_num(self.points["intensity"].astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
-            intensity = np.clip(values / self._whole(), 0, 1)
-        return Scan.from_points(self._xyz(), sensor, intensity)
+            columns["intensity"] = np.clip(values / self._whole(), 0, 1)
+        return scan_of(columns, sensor, source)
 
     def _whole(self) -> float:
         """Returns what intensity a perfect reflector has."""
