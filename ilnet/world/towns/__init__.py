@@ -14,9 +14,22 @@ Afterwards `traffic.py` places vehicles and people (`vehicles.py`) around a sens
 from ilnet.world.towns import town01, town02, town03, town04, town05, town06, town07, town10
 from ilnet.world.towns.plan import build_town
 from ilnet.world.towns.town import SENSOR_HEIGHT, Town
-from ilnet.world.towns.traffic import traffic
+from ilnet.world.towns.traffic import BICYCLES, PEOPLE, Things, draw, traffic
 
-__all__ = ["NAMES", "SENSOR_HEIGHT", "TEST", "TRAIN", "WAYPOINTS", "Town", "build", "traffic"]
+__all__ = [
+    "BICYCLES",
+    "NAMES",
+    "PEOPLE",
+    "SENSOR_HEIGHT",
+    "TEST",
+    "TRAIN",
+    "WAYPOINTS",
+    "Things",
+    "Town",
+    "build",
+    "draw",
+    "traffic",
+]
 
 # Each plan with its number of waypoints. As in the paper, the towns for training (the first six) have 22,244 and the
 # towns for testing 2,847.

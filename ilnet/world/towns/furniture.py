@@ -1,6 +1,7 @@
 """Street furniture and fences.
 
 Each piece stands at the origin on z = 0, in metres; its front or arm points along +x. Copies are placed in the town.
+Lamps, signs, traffic lights, bollards and power poles are poles.
 """
 
 import numpy as np
@@ -29,6 +30,10 @@ __all__ = [
 POLE_HOOKS = ((-1.0, 8.0), (0.35, 8.0), (1.0, 8.0))
 
 
+def _pole(parts: list[Part]) -> Part:
+    return merge(parts)._replace(is_pole=True)
+
+
 def lamp(height: float, arm: float) -> Part:
     """Returns a lamp post; `height` of the lamp and reach of its `arm` along +x in metres."""
     bend = np.array([[0, 0, height - 0.6], [0.25 * arm, 0, height - 0.12], [arm, 0, height]])
@@ -38,7 +43,7 @@ def lamp(height: float, arm: float) -> Part:
         polyline_tubes(bend, 0.035, sides=5),
         boxes([arm - 0.1, -0.13, height - 0.05], [arm + 0.55, 0.13, height + 0.07]),
     ]
-    return merge(parts)
+    return _pole(parts)
 
 
 def sign(shape: int, height: float = 2.4) -> Part:
@@ -57,7 +62,7 @@ def sign(shape: int, height: float = 2.4) -> Part:
         parts.append(boxes([0.035, -0.3, height - 0.35], [0.05, 0.3, height + 0.3]))
     if shape == 3:
         parts.append(boxes([0.035, -0.25, height - 0.62], [0.05, 0.25, height - 0.36]))
-    return merge(parts)
+    return _pole(parts)
 
 
 def traffic_light(arm: float) -> Part:
@@ -76,12 +81,12 @@ def traffic_light(arm: float) -> Part:
         tubes(lens, np.add(lens, (0, 0.16, 0)), 0.11, sides=8, caps=False),
         boxes([-0.12, -0.1, 0.95], [0.12, 0.14, 1.2]),
     ]
-    return merge(parts)
+    return _pole(parts)
 
 
 def bollard() -> Part:
     """Returns a bollard, 0.9 m high."""
-    return merge(
+    return _pole(
         [
             tubes([0, 0, -0.2], [0, 0, 0.85], 0.06, 0.055, sides=8),
             tubes([0, 0, 0.85], [0, 0, 0.93], 0.07, 0.03, sides=8),
@@ -130,7 +135,7 @@ def pole() -> Part:
     """Returns a wooden power pole with a crossarm along y and insulators; wires hang at `POLE_HOOKS`."""
     arms = boxes([[-0.05, -1.1, 7.7], [-0.05, -0.8, 7.0]], [[0.05, 1.1, 7.82], [0.05, 0.8, 7.1]])
     pins = tubes([[0, y, 7.82] for y, _ in POLE_HOOKS], [[0, y, z] for y, z in POLE_HOOKS], 0.04, sides=5)
-    return merge([tubes([0, 0, -0.5], [0, 0, 8.3], 0.15, 0.1, sides=8), arms, pins])
+    return _pole([tubes([0, 0, -0.5], [0, 0, 8.3], 0.15, 0.1, sides=8), arms, pins])
 
 
 def wire(start: np.ndarray, end: np.ndarray, sag: float, radius: float = 0.02) -> Part:

@@ -27,6 +27,8 @@ class Part(NamedTuple):
 
     vertices: np.ndarray
     triangles: np.ndarray
+    is_pole: bool = False
+    """Whether it is a pole with what it carries, which a town tells apart from all else."""
 
 
 class Panel(NamedTuple):

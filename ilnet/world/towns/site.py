@@ -22,6 +22,7 @@ class Site:
         """Starts with the bare ground."""
         self.ground = ground
         self._parts = [ground.mesh()]
+        self._poles: list[tuple[int, int]] = []  # each a part with copies of one pole, and their number
         self._taken = np.zeros((2 * ground.extent + 1,) * 2, dtype=bool)
         self._parking: list[np.ndarray] = []
         self._walks: list[np.ndarray] = []
@@ -37,6 +38,8 @@ class Site:
         """
         xy = np.asarray(xy, dtype=np.float64).reshape(-1, 2)
         if len(xy):
+            if part.is_pole:
+                self._poles.append((len(self._parts), len(xy)))
             self._parts.append(place(part, self.ground.surface(xy), yaw, scale))
 
     def put_at(self, part: Part, position: ArrayLike, yaw: ArrayLike = 0.0) -> None:
@@ -118,12 +121,12 @@ class Site:
 
     def town(self, name: str, seed: int, count: int) -> Town:
         """Returns what has been built, with at most `count` waypoints, as the town of this name and seed."""
-        vertices, triangles = self._mesh()
+        vertices, triangles, poles = self._mesh()
         waypoints, headings = lane_waypoints(self.ground)
         room = self._have_room(waypoints, vertices)
         waypoints, headings = waypoints[room], headings[room]
         parking, walks = (raster(np.concatenate([np.zeros((0, 4)), *spots])) for spots in (self._parking, self._walks))
-        return Town(name, seed, vertices, triangles, waypoints[:count], headings[:count], parking, walks)
+        return Town(name, seed, vertices, triangles, waypoints[:count], headings[:count], parking, walks, poles)
 
     def _have_room(self, waypoints: np.ndarray, vertices: np.ndarray) -> np.ndarray:
         """Returns above which waypoints a sensor has 1.3 m of room, as (N,) bool; a bough may hang over the lane."""
@@ -135,10 +138,15 @@ class Site:
         nearest = [((vertices - at) ** 2).sum(1).min(initial=9.0) for at in sensors]
         return np.array(nearest) > 1.3**2
 
-    def _mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns vertices (V, 3) float32 [m] on the raster and triangles (F, 3) int32 without slivers."""
+    def _mesh(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns vertices (V, 3) float32 [m] on the raster, triangles (F, 3) int32 without slivers, and the poles."""
         whole = merge(self._parts)
         vertices = raster(whole.vertices)
         a, b, c = (vertices[whole.triangles[:, k]].astype(np.float64) for k in range(3))
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        return vertices, whole.triangles[area > 1e-6].astype(np.int32)
+        kept = area > 1e-6
+        starts = np.cumsum([0, *[len(part.triangles) for part in self._parts]])
+        ends = [np.linspace(starts[k], starts[k + 1], count + 1, dtype=int) for k, count in self._poles]
+        spans = np.concatenate([np.zeros((0, 2), int), *[np.stack([e[:-1], e[1:]], 1) for e in ends]])
+        poles = np.append(0, np.cumsum(kept))[spans].astype(np.int32)
+        return vertices, whole.triangles[kept].astype(np.int32), poles

@@ -33,6 +33,8 @@ class Town:
         headings: (N,) float32 driving directions, rad counter-clockwise from +x.
         parking: (P, 4) float32 spots where a car may stand: x, y, z [m] and heading [rad].
         walks: (Q, 4) float32 spots where a person or a bicycle may be: x, y, z [m] and heading [rad].
+        poles: (R, 2) int32, for each lamp, sign, traffic light, bollard and power pole the number of its first triangle
+            and that after its last.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Town:
     headings: np.ndarray
     parking: np.ndarray
     walks: np.ndarray
+    poles: np.ndarray
 
 
 def lane_waypoints(ground: Ground) -> tuple[np.ndarray, np.ndarray]:

@@ -11,10 +11,11 @@ from ilnet.world.towns import vehicles
 from ilnet.world.towns.parts import EMPTY, Part, merge, place, raster
 from ilnet.world.towns.town import LIDAR_REACH, WAYPOINT_SPACING, Town
 
-__all__ = ["traffic"]
+__all__ = ["BICYCLES", "PEOPLE", "Things", "draw", "traffic"]
 
 # Numbers of the kinds, in the order of `_fleet`.
-_CARS, _VAN, _LORRY, _BUS, _CYCLIST, _BICYCLE, _PEOPLE = (0, 1, 2), 3, 4, 5, 6, 7, (8, 9, 10)
+_CARS, _VAN, _LORRY, _BUS, _CYCLIST, _BICYCLE, PEOPLE = (0, 1, 2), 3, 4, 5, 6, 7, (8, 9, 10)
+BICYCLES = _CYCLIST, _BICYCLE
 # The sensor's own car is not drawn. So much is kept free for it ahead and behind, and to each side [m].
 _OWN_CAR = (4.5, 1.3)
 # Vehicles differ in length, width and height by up to 5 %.
@@ -34,7 +35,7 @@ class _Kind(NamedTuple):
     """Distance kept free ahead and behind while it drives, metres."""
 
 
-class _Things(NamedTuple):
+class Things(NamedTuple):
     """N vehicles and people that may be drawn. Where two overlap, the later one is left out."""
 
     spot: np.ndarray
@@ -42,9 +43,27 @@ class _Things(NamedTuple):
     slope: np.ndarray
     """(N,) rise over run along the heading."""
     kind: np.ndarray
-    """(N,) number of the kind."""
+    """(N,) number of the kind; some have names, such as `PEOPLE`."""
     gap: np.ndarray
     """(N,) distance kept free ahead and behind, metres."""
+    drives: np.ndarray
+    """(N,) bool, whether it moves along a lane."""
+    scale: np.ndarray
+    """(N, 3) its size relative to the kind, along its own axes."""
+
+    def some(self, pick: np.ndarray) -> "Things":
+        """Returns some of them, by their numbers or by a mask (N,)."""
+        return Things(*(column[pick] for column in self))
+
+    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns vertices (V, 3) float32 [m] and triangles (F, 3) int32."""
+        part = merge([_instances(self, number) for number in range(len(_fleet()))])
+        return raster(part.vertices), part.triangles.astype(np.int32)
+
+    def owners(self) -> np.ndarray:
+        """Returns the number (F,) of the thing that each triangle of `mesh` belongs to."""
+        order = np.argsort(self.kind, kind="stable")
+        return np.repeat(order, [len(_fleet()[kind].part.triangles) for kind in self.kind[order]])
 
 
 @cache
@@ -61,28 +80,25 @@ def _fleet() -> tuple[_Kind, ...]:
     return tuple(kinds)
 
 
-def traffic(
+def draw(
     town: Town,
     at: ArrayLike,
     seed: int | Sequence[int],
     radius: float = LIDAR_REACH,
     sector: tuple[float, float] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the mesh of the vehicles and people around a sensor. Another seed draws others, more or fewer.
+) -> Things:
+    """Draws the vehicles and people around a sensor. Another seed draws others, more or fewer.
 
     No two overlap. The sensor's own car is not drawn, and its lane is free for about 5 m.
 
     Args:
         town: The town around the sensor.
         at: (3,) position of the sensor in the town's frame, metres.
-        seed: Seed of the draw; the same town, position and seed give the same arrays.
+        seed: Seed of the draw; the same town, position and seed give the same things.
         radius: Largest distance from the sensor at which they are drawn, metres.
         sector: For a sensor that does not see the full circle: the direction in which it looks (rad counter-clockwise
             from +x) and half the width of its field of view (rad). What stands outside is left out; the rest does not
             change.
-
-    Returns:
-        Vertices (V, 3) float32 [m] and triangles (F, 3) int32; both empty if nothing was drawn.
 
     Raises:
         ValueError: If `at` is not three finite numbers.
@@ -103,16 +119,25 @@ def traffic(
         _parked(parking, lane, slope, rng),
         _walking(walks, rng),
     ]
-    things = _Things(*(np.concatenate(column) for column in zip(*drawn, strict=True)))
+    things = Things(*(np.concatenate(column) for column in zip(*drawn, strict=True)))
     heading = lane[_distance(lane, sensor).argmin(), 3] if len(lane) else 0.0
-    keep = _apart(things, sensor, heading)
-    things = _Things(*(column[keep] for column in things))
-    scale = rng.uniform(2 - _STRETCH, _STRETCH, (len(keep), 3))
-    if sector:
-        seen = _in_sector(things, sensor, *sector)
-        things, scale = _Things(*(column[seen] for column in things)), scale[seen]
-    part = merge([_instances(things, number, scale) for number in range(len(_fleet()))])
-    return raster(part.vertices), part.triangles.astype(np.int32)
+    things = things.some(_apart(things, sensor, heading))
+    things = things._replace(scale=rng.uniform(2 - _STRETCH, _STRETCH, (len(things.kind), 3)))
+    return things.some(_in_sector(things, sensor, *sector)) if sector else things
+
+
+def traffic(
+    town: Town, at: ArrayLike, seed: int | Sequence[int], sector: tuple[float, float] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the mesh of what `draw` draws, whose arguments it takes, within the reach of a LiDAR.
+
+    Returns:
+        Vertices (V, 3) float32 [m] and triangles (F, 3) int32; both empty if nothing was drawn.
+
+    Raises:
+        ValueError: If `at` is not three finite numbers.
+    """
+    return draw(town, at, seed, sector=sector).mesh()
 
 
 def _distance(points: np.ndarray, sensor: np.ndarray) -> np.ndarray:
@@ -120,7 +145,7 @@ def _distance(points: np.ndarray, sensor: np.ndarray) -> np.ndarray:
     return np.hypot(points[:, 0] - sensor[0], points[:, 1] - sensor[1])
 
 
-def _in_sector(things: _Things, sensor: np.ndarray, heading: float, half: float) -> np.ndarray:
+def _in_sector(things: Things, sensor: np.ndarray, heading: float, half: float) -> np.ndarray:
     """Returns which things reach into a sector, as (N,) bool. The circle around each one decides."""
     away = things.spot[:, :2] - sensor
     distance = np.hypot(away[:, 0], away[:, 1])
@@ -137,10 +162,12 @@ def _slope(town: Town, near: np.ndarray) -> np.ndarray:
     return np.where((run > 1.0) & (run < 2.5), step[:, 2] / np.maximum(run, 1.0), 0.0)
 
 
-def _things(spot: np.ndarray, slope: ArrayLike, kind: np.ndarray, drives: bool) -> _Things:
+def _things(spot: np.ndarray, slope: ArrayLike, kind: np.ndarray, drives: bool) -> Things:
     """Returns things with the gaps of their kinds if they drive, else with small ones."""
-    gap = np.array([k.gap for k in _fleet()])[kind] if drives else np.full(len(spot), 0.1)
-    return _Things(spot, np.broadcast_to(np.asarray(slope, dtype=np.float64), (len(spot),)), kind, gap)
+    count = len(spot)
+    gap = np.array([k.gap for k in _fleet()])[kind] if drives else np.full(count, 0.1)
+    slopes = np.broadcast_to(np.asarray(slope, dtype=np.float64), (count,))
+    return Things(spot, slopes, kind, gap, np.full(count, drives), np.ones((count, 3)))
 
 
 def _aside(spot: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -149,7 +176,7 @@ def _aside(spot: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.column_stack([spot[:, :2] + step, spot[:, 2:]])
 
 
-def _driving(lane: np.ndarray, slope: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> _Things:
+def _driving(lane: np.ndarray, slope: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> Things:
     """Draws what drives on the lanes, from a few vehicles to dense traffic.
 
     Cyclists keep to the right, and to streets that have people beside them.
@@ -165,13 +192,13 @@ def _driving(lane: np.ndarray, slope: np.ndarray, walks: np.ndarray, rng: np.ran
     return _things(_aside(lane[pick], right), slope[pick], kind, drives=True)
 
 
-def _crossing(lane: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> _Things:
+def _crossing(lane: np.ndarray, walks: np.ndarray, rng: np.random.Generator) -> Things:
     """Draws a few people who cross a lane, where people walk beside it."""
     spot = lane[rng.random(len(lane)) < rng.uniform(0, 5) / max(len(lane), 1)]
     spot = spot[_beside(spot, walks)]
     spot = _aside(spot, rng.uniform(-1.5, 1.5, len(spot)))
     spot[:, 3] += np.pi / 2 * rng.choice([-1, 1], len(spot))
-    return _things(spot, 0.0, rng.choice(_PEOPLE, len(spot)), drives=False)
+    return _things(spot, 0.0, rng.choice(PEOPLE, len(spot)), drives=False)
 
 
 def _beside(lane: np.ndarray, walks: np.ndarray) -> np.ndarray:
@@ -179,7 +206,7 @@ def _beside(lane: np.ndarray, walks: np.ndarray) -> np.ndarray:
     return (np.hypot(*(lane[:, None, k] - walks[None, :, k] for k in (0, 1))) < 12).any(1)
 
 
-def _parked(parking: np.ndarray, lane: np.ndarray, slope: np.ndarray, rng: np.random.Generator) -> _Things:
+def _parked(parking: np.ndarray, lane: np.ndarray, slope: np.ndarray, rng: np.random.Generator) -> Things:
     """Draws parked cars, vans and a few bicycles; most face the way the traffic goes."""
     spot = parking[rng.random(len(parking)) < rng.uniform(0.15, 0.75)]
     kind = rng.choice([*_CARS, _VAN, _BICYCLE], len(spot), p=[0.36, 0.27, 0.22, 0.12, 0.03])
@@ -191,14 +218,14 @@ def _parked(parking: np.ndarray, lane: np.ndarray, slope: np.ndarray, rng: np.ra
     return _things(spot, tilt, kind, drives=False)
 
 
-def _walking(walks: np.ndarray, rng: np.random.Generator) -> _Things:
+def _walking(walks: np.ndarray, rng: np.random.Generator) -> Things:
     """Draws people on the pavements, and a few bicycles."""
     spot = walks[rng.random(len(walks)) < rng.uniform(0.02, 0.3)]
-    kind = rng.choice([*_PEOPLE, _BICYCLE], len(spot), p=[0.35, 0.3, 0.2, 0.15])
+    kind = rng.choice([*PEOPLE, _BICYCLE], len(spot), p=[0.35, 0.3, 0.2, 0.15])
     return _things(spot, 0.0, kind, drives=False)
 
 
-def _apart(things: _Things, sensor: np.ndarray, heading: float) -> np.ndarray:
+def _apart(things: Things, sensor: np.ndarray, heading: float) -> np.ndarray:
     """Returns the numbers of the things that overlap neither the sensor's car nor a thing kept before them.
 
     Two rectangles overlap if, along each of the four axes of the two, the distance between their centres is less than
@@ -225,13 +252,13 @@ def _apart(things: _Things, sensor: np.ndarray, heading: float) -> np.ndarray:
     return np.nonzero(kept[1:])[0]
 
 
-def _instances(things: _Things, number: int, scale: np.ndarray) -> Part:
-    """Returns the mesh of all things of one kind, tilted like the road; `scale` (N, 3) has a row for each thing."""
+def _instances(things: Things, number: int) -> Part:
+    """Returns the mesh of all things of one kind, tilted like the road."""
     pick = things.kind == number
     if not pick.any():
         return EMPTY
     part = _fleet()[number].part
-    spot = things.spot[pick]
-    placed = place(part, spot[:, :3], spot[:, 3], scale[pick])
-    rise = part.vertices[:, 0] * (scale[pick, :1] * things.slope[pick, None])
+    spot, scale = things.spot[pick], things.scale[pick]
+    placed = place(part, spot[:, :3], spot[:, 3], scale)
+    rise = part.vertices[:, 0] * (scale[:, :1] * things.slope[pick, None])
     return Part(placed.vertices + np.array([0.0, 0.0, 1.0]) * rise.reshape(-1, 1), placed.triangles)

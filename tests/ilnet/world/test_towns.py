@@ -115,6 +115,20 @@ def test_arrays_have_the_documented_types_and_shapes(town):
     np.testing.assert_array_equal(town.vertices * 1024, np.round(town.vertices * 1024))
 
 
+def test_poles_are_upright_and_each_is_one_thing(town):
+    assert town.poles.dtype == np.int32
+    assert len(town.poles) > 50
+    order = np.sort(town.poles, axis=0)
+    assert (order[:, 0] < order[:, 1]).all()
+    assert (order[1:, 0] >= order[:-1, 1]).all()
+    for first, last in town.poles:
+        corners = town.vertices[town.triangles[first:last].ravel()].astype(np.float64)
+        low, high = corners.min(0), corners.max(0)
+        assert 1.0 < high[2] - low[2] < 13.0
+        foot = corners[corners[:, 2] < low[2] + 0.3]
+        assert np.ptp(foot[:, :2], axis=0).max() < 0.5
+
+
 def test_triangles_have_area(town):
     a, b, c = (town.vertices[town.triangles[:, k]].astype(np.float64) for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -195,6 +209,21 @@ def test_traffic_stands_on_the_ground_and_clear_of_the_sensor(town, mesh, sensor
     assert np.ptp(sizes) > 0.5 * np.median(sizes)
 
 
+def test_every_triangle_of_the_traffic_has_its_owner(town, sensors):
+    things = towns.draw(town, sensors[7], 7)
+    vertices, triangles = things.mesh()
+    for one, other in zip((vertices, triangles), towns.traffic(town, sensors[7], 7), strict=True):
+        np.testing.assert_array_equal(one, other)
+    owners = things.owners()
+    assert len(owners) == len(triangles)
+    middles = vertices[triangles].mean(1)
+    away = np.hypot(*(middles[:, :2] - things.spot[owners, :2]).T)
+    people = np.isin(things.kind[owners], towns.PEOPLE)
+    assert away[people].max(initial=0) < 0.6
+    assert away.max() < 6.0
+    assert set(owners) == set(range(len(things.kind)))
+
+
 def test_own_lane_is_free_ahead(town):
     for number in range(0, len(town.waypoints), 301):
         sensor, heading = town.waypoints[number] + np.float32([0, 0, SENSOR_HEIGHT]), town.headings[number]
@@ -209,7 +238,7 @@ def test_traffic_does_not_overlap():
     zero = np.zeros_like(x)
     lane, spots = np.column_stack([x, zero, zero]), np.column_stack([x, zero, zero, zero])
     empty = np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.int32)
-    line = towns.Town("a line", 0, *empty, lane, zero, spots, np.zeros((0, 4), dtype=np.float32))
+    line = towns.Town("a line", 0, *empty, lane, zero, spots, np.zeros((0, 4), dtype=np.float32), empty[1][:, :2])
     for seed in range(20):
         vertices, triangles = towns.traffic(line, (0.0, 0.0, SENSOR_HEIGHT), seed)
         corners = vertices[triangles]
@@ -233,7 +262,9 @@ def test_no_traffic_where_there_are_no_lanes(town):
 @pytest.mark.parametrize("at", [(0.0, 0.0), (0.0, float("nan"), SENSOR_HEIGHT)])
 def test_traffic_refuses_a_bad_position(at):
     none = np.zeros((0, 3), dtype=np.float32)
-    nowhere = towns.Town("nowhere", 0, none, none.astype(np.int32), none, none[:, 0], none, none)
+    nowhere = towns.Town(
+        "nowhere", 0, none, none.astype(np.int32), none, none[:, 0], none, none, none[:, :2].astype(np.int32)
+    )
     with pytest.raises(ValueError, match=r"^at is .*; it should be three finite numbers"):
         towns.traffic(nowhere, at, 0)
 
