@@ -25,6 +25,8 @@ _EXPERIMENTS = (
     "fair",
     "alignment",
     "where",
+    "odometry",
+    "thin",
     "all",
 )
 
@@ -677,7 +679,7 @@ def experiment(
     if not names:
         raise click.UsageError("name some experiments, or all")
     from ilnet import scan_files
-    from ilnet.commands import experiment
+    from ilnet.commands import experiment, odometry
     from ilnet.commands.study import Study
 
     chosen = tuple(experiment.EXPERIMENTS) if "all" in names else names
@@ -685,6 +687,8 @@ def experiment(
     for name, (option, value) in needs.items():
         if name in chosen and not value:  # said before hours of training, not after
             raise click.UsageError(f"{name} needs {option}")
+    if "odometry" in chosen:
+        odometry.check_installed()
     files = tuple(path for named in measured for path in scan_files.listed(named))
     study = Study(preset, out, scans or 20, seeds, data, files, models, scans)
     for name in chosen:

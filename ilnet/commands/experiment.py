@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ilnet import data, models, scan_files
-from ilnet.commands import evidence, fair, plot, where
+from ilnet.commands import evidence, fair, odometry, plot, thin, where
 from ilnet.commands.study import COLOURS, SERIES, Study, grouped_bars, loaded, made_with, spans
 from ilnet.learning import evaluate
 from ilnet.sensor import PAPER_INPUT, format_size
@@ -273,6 +273,8 @@ EXPERIMENTS: dict[str, Callable[[Study], None]] = {
     "fair": fair.fair,
     "alignment": fair.alignment,
     "where": where.where,
+    "odometry": odometry.odometry,
+    "thin": thin.thin,
 }
 
 

@@ -23,7 +23,7 @@ from ilnet.world import simulate, towns
 __all__ = ["COLOURS", "FIGURES", "SERIES", "Study", "by_case", "grouped_bars", "loaded", "made_with", "spans"]
 
 # Experiments that compare the networks that ship, unless a preset is given to train others.
-_SHIPPED = "table", "real", "confidence", "sensors", "alignment", "where"
+_SHIPPED = "table", "real", "confidence", "sensors", "alignment", "where", "odometry", "thin"
 
 FIGURES = {"iou": "IoU", "mae": "MAE [m]", "floating": "floating"}
 """The figures that are compared over several seeds, and what they are called."""
