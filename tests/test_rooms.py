@@ -17,6 +17,7 @@ FLOORS = [
     {"ilnet.models", "ilnet.world"},
     {"ilnet.scan_files"},
     {"ilnet.scan"},
+    {"ilnet.fit"},
     {"ilnet.holes", "ilnet.sensor_files"},
     {"ilnet.sensor"},
     {"ilnet.sensors"},
