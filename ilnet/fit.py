@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+from scipy import fft
+from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 from scipy.signal import find_peaks
 
 from ilnet.sensor import PRESETS, Sensor
@@ -44,9 +45,11 @@ _MOST_FOCUSED = 60_000
 _OFF = 0.2
 # A point whose place is unsure by this length [m] tells nothing about rows that are closer than it.
 _UNSURE = 0.05
+# Elevations are exact if, counted in bins of a width [deg], they repeat so often compared with their surroundings.
+_EXACT_BIN, _EXACT = 0.005, 20.0
 _FEWEST_JUDGED = 100
 # Shares of points off the rows, and of points lost to nearer ones of their pixel, that the right sensor does not reach.
-_MOST_OFF, _MOST_LOST = 0.25, 0.45
+_MOST_OFF, _MOST_LOST = 0.35, 0.45
 
 _FEWEST_COLUMNS, _ANGLE_BINS = 32, 1 << 16
 # An empty sector beyond it is no gap in a full circle [rad].
@@ -137,7 +140,8 @@ def off_rows(sensor: Sensor, elevation: np.ndarray, distance: np.ndarray) -> flo
     """Returns the share of points that lie off the rows of a sensor, or NaN where fewer than 100 points can tell.
 
     A point can tell if it is so far away that 5 cm move it by less than it may lie off. So neither noise nor an origin
-    a few centimetres from that of the beams counts.
+    a few centimetres from that of the beams counts. Where no point is so far away, but elevations repeat exactly, all
+    can tell.
 
     Args:
         sensor: The sensor.
@@ -151,9 +155,18 @@ def off_rows(sensor: Sensor, elevation: np.ndarray, distance: np.ndarray) -> flo
     below, above = np.clip(above - 1, 0, None), np.clip(above, None, len(rows) - 1)
     away = np.minimum(np.abs(elevation - rows[below]), np.abs(elevation - rows[above]))
     tells = _UNSURE / distance < _OFF * spacing
+    if np.count_nonzero(tells) < _FEWEST_JUDGED and _are_exact(elevation):
+        tells = distance > 0
     if np.count_nonzero(tells) < _FEWEST_JUDGED:
         return math.nan
     return float((away > _OFF * spacing)[tells].mean())
+
+
+def _are_exact(elevation: np.ndarray) -> bool:
+    """Returns whether elevations [rad] repeat to a few thousandths of a degree."""
+    counts = np.bincount(((np.rad2deg(elevation) + 90) / _EXACT_BIN).astype(np.int64)).astype(np.float64)
+    around = uniform_filter1d(counts, round(_SMOOTH / _EXACT_BIN), mode="constant")
+    return bool((counts**2).sum() > _EXACT * (counts * around).sum())
 
 
 def doubt(sensor: Sensor, elevation: np.ndarray, distance: np.ndarray, lost: float) -> str:
@@ -265,24 +278,23 @@ def _nearest(rows: np.ndarray, elevation: np.ndarray) -> np.ndarray:
 def _peaks(elevation: np.ndarray, distance: np.ndarray, angle: float, length: float) -> np.ndarray:
     """Returns where the density of elevations has peaks, smoothed by an angle [deg] or a length [m] over the range."""
     lowest = elevation.min() - 4 * _WIDEST
-    bins = int((elevation.max() - lowest + 4 * _WIDEST) / _BIN) + 1
+    bins = fft.next_fast_len(int((elevation.max() - lowest + 4 * _WIDEST) / _BIN) + 1, real=True)
     cell = ((elevation - lowest) / _BIN).astype(np.int64)
-    density = np.zeros(bins)
+    parts = [(cell, angle)]
     if length:  # half octaves of range share a kernel
         half_octave = np.floor(2 * np.log2(distance)).astype(np.int64)
-        kernels = {int(n): max(np.rad2deg(length * 2 ** -((n + 0.5) / 2)), 2 * _BIN) for n in np.unique(half_octave)}
-        parts = [(cell[half_octave == n], width) for n, width in kernels.items() if width < _WIDEST]
-    else:
-        parts = [(cell, angle)]
-    narrowest = math.inf
-    for cells, width in parts:
-        counts = np.bincount(cells, minlength=bins).astype(np.float64)
-        density += gaussian_filter1d(counts, width / _BIN, mode="constant")
-        narrowest = min(narrowest, width)
+        widths = {int(n): max(math.degrees(length * 2 ** -((n + 0.5) / 2)), 2 * _BIN) for n in np.unique(half_octave)}
+        parts = [(cell[half_octave == n], width) for n, width in widths.items() if width < _WIDEST]
     if not parts:
         return np.empty(0)
+    frequency = fft.rfftfreq(bins, _BIN)
+    spectrum = np.zeros(len(frequency), np.complex128)
+    for cells, width in parts:
+        kernel = np.exp(-2 * (math.pi * width * frequency) ** 2)
+        spectrum += fft.rfft(np.bincount(cells, minlength=bins).astype(np.float64)) * kernel
+    density = fft.irfft(spectrum, bins)
     # Nearly the height of `_LEAST_RETURNS` equal elevations.
-    least = 0.8 * _LEAST_RETURNS * _BIN / (math.sqrt(math.tau) * narrowest)
+    least = 0.8 * _LEAST_RETURNS * _BIN / (math.sqrt(math.tau) * min(width for _, width in parts))
     found, _ = find_peaks(density, prominence=least)
     return lowest + (found + 0.5) * _BIN
 
@@ -332,7 +344,8 @@ def _columns(azimuth: np.ndarray, row: np.ndarray) -> np.ndarray:
         total += spectrum
     power[:_FEWEST_COLUMNS] = 0
     if power.max() > 10 * np.median(power[_FEWEST_COLUMNS:]):
-        columns = int(np.flatnonzero(power > 0.5 * power.max())[0])
+        first = int(np.flatnonzero(power > 0.5 * power.max())[0])  # multiples are lines too
+        columns = first + int(power[first : first + first // 2].argmax())  # in a sector lines are wide
     else:  # no grid: as many as the usual step of a row allows
         order = np.lexsort((azimuth, row))
         steps = np.diff(azimuth[order])[np.diff(row[order]) == 0]

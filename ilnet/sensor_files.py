@@ -16,7 +16,7 @@ import numpy as np
 
 from ilnet.sensor import PRESETS, Sensor
 
-__all__ = ["named", "read", "write"]
+__all__ = ["check_suffix", "named", "read", "write"]
 
 _SUFFIXES = (".json", ".npz")
 # A million angles in digits: beyond it, a file is no table.
@@ -40,6 +40,12 @@ def named(text: str) -> Sensor:
     )
 
 
+def check_suffix(path: Path) -> None:
+    """Raises a ValueError if a file of that name cannot hold a table."""
+    if path.suffix.lower() not in _SUFFIXES:
+        raise ValueError(f"{path}: its suffix is {path.suffix!r}; it should be one of {', '.join(_SUFFIXES)}")
+
+
 def read(path: str | Path) -> Sensor:
     """Returns the sensor in a `.json` or `.npz` file; by default it has the name of the file.
 
@@ -50,9 +56,8 @@ def read(path: str | Path) -> Sensor:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such file")
+    check_suffix(path)
     try:
-        if path.suffix.lower() not in _SUFFIXES:
-            raise ValueError(f"its suffix is {path.suffix!r}; it should be one of {', '.join(_SUFFIXES)}")
         table = _json(path) if path.suffix.lower() == ".json" else _npz(path)
         return Sensor.from_table({**table, "name": str(table.get("name") or path.stem)})
     except ValueError as error:
@@ -66,8 +71,7 @@ def write(path: str | Path, sensor: Sensor) -> None:
         ValueError: If the suffix is another.
     """
     path = Path(path)
-    if path.suffix.lower() not in _SUFFIXES:
-        raise ValueError(f"{path}: its suffix is {path.suffix!r}; it should be one of {', '.join(_SUFFIXES)}")
+    check_suffix(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays: dict[str, Any] = {key: np.array(value) for key, value in sensor.table().items()}
     partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}")

@@ -696,6 +696,61 @@ def experiment(
         click.echo(experiment.results(study))
 
 
+@cli.group(name="sensor")
+def sensor_group() -> None:
+    """List sensors, show one, or find the one that measured some points."""
+
+
+@sensor_group.command(name="list")
+def sensor_list() -> None:
+    """List the presets: rows, columns, elevations, ranges, and where the numbers stand."""
+    from ilnet.commands import sensors
+
+    click.echo(sensors.listing())
+
+
+@sensor_group.command(name="show")
+@click.argument("name", metavar="NAME|FILE")
+@click.option("--out", type=Path, metavar="FILE", help="Draw its rows into this picture.")
+@click.option("--json", "as_json", is_flag=True, help="Print the table as a file of --sensor holds it.")
+def sensor_show(name: str, out: Path | None, as_json: bool) -> None:
+    """Show the rows of a preset, or of a table in a .json or .npz file."""
+    from ilnet import sensor_files
+    from ilnet.commands import sensors
+
+    shown = sensor_files.named(name)
+    click.echo(json.dumps(shown.table()) if as_json else sensors.angles(shown))
+    if out:
+        sensors.draw(shown, out)
+
+
+@sensor_group.command(name="estimate")
+@click.argument("files", nargs=-1, type=Path, required=True)
+@click.option("--out", type=Path, metavar="FILE", help="Write the table (.json or .npz), which --sensor FILE takes.")
+@click.option("--picture", type=Path, metavar="FILE", help="Draw the points by elevation, and the rows.")
+def sensor_estimate(files: tuple[Path, ...], out: Path | None, picture: Path | None) -> None:
+    """Find the rows and columns of the one sensor that measured the points in FILES.
+
+    By the rings of the points where all files have them, else by their elevations. Rows without any return cannot be
+    found: several files show more of them.
+    """
+    from ilnet import sensor_files
+    from ilnet.commands import sensors
+
+    if out:
+        sensor_files.check_suffix(out)
+    found, clouds = sensors.estimate(files)
+    click.echo(sensors.summary(found))
+    if out:
+        sensor_files.write(out, found.sensor)
+        click.echo(f"table: {out}")
+    else:
+        click.echo(sensors.angles(found.sensor))
+    if picture:
+        sensors.draw_fit(found, clouds, picture)
+        click.echo(f"picture: {picture}")
+
+
 def _scan_pair(scan: Path, rows: int | None, sensor: str | None) -> tuple[Any, Any]:
     """Returns what `evaluate.scan_pair` does; if the file lacks its sensor, the error names the option."""
     from ilnet.learning import evaluate

@@ -9,7 +9,7 @@ from typing import BinaryIO
 import numpy as np
 import torch
 
-from ilnet import memory
+from ilnet import fit, memory
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 
@@ -55,6 +55,9 @@ _LONGEST = 2.0
 _NEAREST_MILLIMETRES = 0.3
 # The least share of the returns within the sensor's limits if the unit is right.
 _LEAST_WITHIN = 0.01
+# A sensor is judged by about so many points, until it is doubted.
+_JUDGED = 50_000
+_doubted: set[str] = set()
 # A header has at most so many bytes.
 _LONGEST_HEADER = 1 << 20
 
@@ -124,7 +127,26 @@ def scan_of(points: Mapping[str, np.ndarray], sensor: Sensor, source: str = "poi
             others["time"] = time
         if "confidence" in points:
             others["confidence"] = real("confidence", points["confidence"])
-    return Scan.from_points(xyz, sensor, **others, rows=rows)
+    scan = Scan.from_points(xyz, sensor, **others, rows=rows)
+    if rows is None:  # by their numbers, rows need no angles
+        _doubt(sensor, xyz[usable], int((scan.ranges > 0).sum()), source)
+    return scan
+
+
+def _doubt(sensor: Sensor, xyz: np.ndarray, returns: int, source: str) -> None:
+    """Notes, once for each sensor, if it is likely not the one that measured points (N, 3) [m] that became returns."""
+    known_as = f"{sensor.name} {sensor.size}"
+    if known_as in _doubted:
+        return
+    distance = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
+    elevation = np.arcsin(np.clip(xyz[:, 2] / distance, -1, 1))
+    # Of points in view, which are all that can share a pixel.
+    seen = np.count_nonzero((elevation >= sensor.elevations.min()) & (elevation <= sensor.elevations.max()))
+    lost = 1 - returns / seen if sensor.wrap and seen else 0.0
+    step = len(xyz) // _JUDGED + 1
+    if doubt := fit.doubt(sensor, elevation[::step], distance[::step], lost):
+        _doubted.add(known_as)
+        note(source, f"{doubt} `ilnet sensor estimate` finds the rows of the points")
 
 
 def columns_of(scan: Scan) -> Points:

@@ -84,7 +84,8 @@ def test_several_clouds_have_more_rows():
     """Each cloud has the returns of other rows; those with few count."""
     sensor = preset("os1-32-gradient")
     ranges = street(sensor)
-    ranges[:2, 5:] = 0  # five returns at most
+    ranges[:2] = 0
+    ranges[:2, 100:105] = 20.0  # five returns
     first, second = ranges.copy(), ranges.copy()
     first[::3] = 0
     second[1::3] = 0
@@ -172,7 +173,14 @@ def test_measured_scans_are_not_doubted(path):
 
 def test_few_points_tell_nothing():
     assert np.isnan(off_rows(preset("vls-128"), np.full(99, 0.3), np.full(99, 90.0)))
-    assert np.isnan(off_rows(preset("vls-128"), np.zeros(9999), np.full(9999, 2.0)))
+    near = np.random.default_rng(0).uniform(-0.2, 0.1, 9999)
+    assert np.isnan(off_rows(preset("vls-128"), near, np.full(9999, 2.0)))
+
+
+def test_near_points_tell_where_they_are_exact():
+    rows = np.repeat(preset("vlp-32c").elevations, 300).astype(np.float32).astype(np.float64)
+    assert off_rows(preset("vlp-32c"), rows, np.full(len(rows), 2.0)) == 0
+    assert off_rows(preset("os1-128"), rows, np.full(len(rows), 2.0)) > 0.4
 
 
 def test_rows_of_a_preset():
