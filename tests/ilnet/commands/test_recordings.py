@@ -4,7 +4,6 @@ import re
 import shutil
 import sqlite3
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +16,7 @@ from ilnet.sensor import preset
 from ilnet.world import simulate
 from ilnet.world.simulate import pose
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "scan_files"))
-import recorded
+from ..scan_files import recorded
 
 pytest.importorskip("rosbags", reason="needs the extra io")
 

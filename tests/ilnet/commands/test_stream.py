@@ -3,11 +3,9 @@
 import json
 import re
 import socket
-import sys
 import threading
 import time
 import urllib.request
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,8 +17,7 @@ from ilnet.sensor import preset
 from ilnet.world import simulate
 from ilnet.world.simulate import pose
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "scan_files"))
-import recorded
+from ..scan_files import recorded
 
 pytest.importorskip("rosbags", reason="needs the extra io")
 pytest.importorskip("velodyne_decoder", reason="needs the extra io")

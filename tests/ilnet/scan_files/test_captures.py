@@ -3,21 +3,18 @@
 import importlib.util
 import json
 import struct
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from ilnet.scan import Scan
-from ilnet.scan_files import captures, ouster
+from ilnet.scan_files import bags, captures, clouds, ouster
 from ilnet.sensor import preset
 from ilnet.world import simulate
 from ilnet.world.simulate import pose
 
-sys.path.insert(0, str(Path(__file__).parent))
-import recorded
+from . import recorded
 
 pytest.importorskip("velodyne_decoder", reason="needs the extra io")
 
@@ -178,3 +175,57 @@ def test_metadata_that_is_wrong_is_refused_in_a_line(tmp_path, change, complaint
     (tmp_path / "a.json").write_text(json.dumps(found))
     with pytest.raises(ValueError, match=rf"a\.json: .*{complaint}"):
         ouster.Metadata(tmp_path / "a.json")
+
+
+def damaged(content, random):
+    """Bytes cut off, left out, put in or overwritten, near the start as often as anywhere."""
+    data, at = bytearray(content), int(random.integers(random.choice([40, 400, len(content)])))
+    match random.integers(5):
+        case 0:
+            del data[random.integers(len(data)) :]
+        case 1:
+            del data[at : at + random.integers(1, 200)]
+        case 2:
+            data[at:at] = random.bytes(random.integers(1, 100))
+        case 3:
+            data[at : at + 4] = struct.pack("<I", random.choice([0, 1, 2**31 - 1, 2**32 - 1]))
+        case 4:
+            for place in random.integers(0, len(data), 20):
+                data[place] = random.integers(256)
+    return bytes(data)
+
+
+@pytest.mark.parametrize(("kind", "times"), [("velodyne", 50), ("ouster", 200), ("bag", 200), ("mcap", 200)])
+def test_damaged_recordings_are_refused_in_a_line(yard, tmp_path, kind, times):
+    metadata = tmp_path / "a.json"
+    metadata.write_text(recorded.ouster_metadata(OUSTER))
+    scan = measured(yard, OUSTER)
+    path = tmp_path / (f"a.{kind}" if kind in ("bag", "mcap") else "a.pcap")
+    if kind == "velodyne":
+        path.write_bytes(recorded.pcap(recorded.vlp16_packets([measured(yard, VLP16)])))
+    elif kind == "ouster":
+        path.write_bytes(recorded.pcap(recorded.ouster_packets([scan], metadata.read_text())))
+    else:
+        pytest.importorskip("rosbags", reason="needs the extra io")
+        with bags.written(path) as bag:
+            fields = {axis: np.dtype("<f4") for axis in "xyz"}
+            cloud = clouds.pack(bags.blank(kind == "mcap", 0, "lidar"), scan, {}, fields)
+            bag.write_cloud(bag.add("/points"), 0, cloud)
+
+    def read():
+        if path.suffix == ".pcap":
+            return list(captures.sweeps(path, metadata=metadata if kind == "ouster" else None))
+        with bags.Bag(path) as bag:
+            return [bag.cloud(message).scan(OUSTER) for message in bag.messages()]
+
+    whole, random, lines = path.read_bytes(), np.random.default_rng(0), []
+    assert len(read()) == 1
+    for _ in range(times):
+        path.write_bytes(damaged(whole, random))
+        try:
+            read()
+        except (ValueError, OSError) as error:
+            lines.append(str(error))
+    assert 0 < len(lines) < times
+    assert max(map(len, lines)) < 600
+    assert "\n" not in "".join(lines)
