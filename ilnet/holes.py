@@ -40,9 +40,9 @@ def find(pixels: torch.Tensor, sensor: Sensor) -> torch.Tensor:
     between them, but sky, or what absorbs.
 
     The truth is known for scans whose rays are. Three simulated scans of uneven, tilted beams with lost returns, and
-    five measured ones, were projected to seven grids each. At least 99 % of the pixels found were holes, in all but
-    one, where 98 % were. Of the holes before a surface 85 to 100 % were found. Of a measured scan on its own grid,
-    nothing is found.
+    five measured ones, were projected to seven grids each. Of the pixels found, 99 % and more were holes. Of the holes
+    before a simulated surface, 85 to 100 % were found. Of the no returns, up to 1 % were taken for holes; on grids with
+    1.4 times the columns of the sensor and more, up to 13 %. On its own grid, nothing is found in a measured scan.
 
     Args:
         pixels: (N, 2) pixel coordinates (row, column) of all points, in view.

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import torch
 
+from ilnet.learning import metrics
 from ilnet.scan import Pair, Scan
 from kernels.checks import TOLERANCE
 
@@ -47,7 +48,7 @@ def told(answers: Sequence[Scan], pairs: Sequence[Pair]) -> tuple[torch.Tensor, 
             raise ValueError("answers have no confidence; they should be scans by a model that tells it")
         pixels = scan.sensor.grid_queries(truth.sensor).to(answer.ranges.device)
         between = ((pixels - pixels.round()).abs() > _MEASURED).any(-1)
-        points = between & (answer.ranges > 0)
+        points = between & (metrics.judged(answer.ranges, truth) > 0)
         confidences.append(answer.confidence[points])
         right.append(((answer.ranges - truth.filled()).abs() <= TOLERANCE)[points])
     return torch.cat(confidences), torch.cat(right)

@@ -89,7 +89,8 @@ def test_demo_of_a_scan_is_judged_against_its_own_rows(tmp_path, scan_file):
     assert result["methods"]["bilinear-inverse"]["mae"] < result["methods"]["nearest"]["mae"]
 
 
-EVALUATED = {"model", "size", "scans", "mae", "iou", "precision", "recall", "f1", "floating", "edge_mae", "chamfer"}
+EVALUATED = {"model", "size", "scans", "unseen"}
+EVALUATED |= {"mae", "iou", "precision", "recall", "f1", "floating", "edge_mae", "chamfer"}
 
 
 def test_evaluate_measures_models_at_positions_in_a_mesh(command, tmp_path, mesh_file):
