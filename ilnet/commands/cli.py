@@ -469,7 +469,7 @@ def stream(
 
 @cli.command()
 @click.argument("files", nargs=-1, required=True, type=Path)
-@click.option("--from", "origin", metavar="NAME|FILE", help="Preset or table with the angles, if files lack them.")
+@click.option("--from", "origin", metavar="NAME|FILE", help="Preset or table with the angles of files other than .npz.")
 @click.option(
     "--out",
     type=Path,

@@ -24,7 +24,7 @@ def run(files: Sequence[Path], out: Path, sensor: Sensor | None = None) -> None:
         files: One to three scans: what was measured, what was predicted from it, and the truth. With two, the second is
             compared with the first; with three, with the third.
         out: An `.html` or a `.png` file.
-        sensor: The sensor of files that do not hold their angles; all of one size.
+        sensor: The sensor of the files other than `.npz`.
 
     Raises:
         OSError: If a file is missing or unreadable.
@@ -34,7 +34,9 @@ def run(files: Sequence[Path], out: Path, sensor: Sensor | None = None) -> None:
         raise ValueError(f"there are {len(files)} files; they should be a scan, perhaps a denser one, and the truth")
     if out.suffix not in (".html", ".png"):
         raise ValueError(f"out is {out}; it should end in .html, a page, or in .png, a picture")
-    found = panels({path.name: scan_files.read(path, sensor) for path in files})
+    # An .npz file holds its angles, so that the sensor of a denser .ply can be named beside it.
+    own = {path: None if path.suffix.lower() == ".npz" else sensor for path in files}
+    found = panels({path.name: scan_files.read(path, sensor) for path, sensor in own.items()})
     out.parent.mkdir(parents=True, exist_ok=True)
     if out.suffix == ".html":
         out.write_text(viewer.page(found))

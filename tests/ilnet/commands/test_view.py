@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ilnet import scan_files
+from ilnet import scan_files, sensor_files
 from ilnet.commands import view
 from ilnet.scan import Scan
 from ilnet.sensor import preset
@@ -66,6 +66,14 @@ def test_without_the_truth_a_scan_is_compared_with_what_was_measured(files):
     assert away.isfinite().sum() > measured.size * 30
     assert bool(away[truth.ranges == 0].isnan().all())
     assert len(view.panels({"in": sparse, "dense": truth})) == 3
+
+
+def test_points_beside_a_scan_that_holds_its_angles(command, files, tmp_path):
+    scan_files.write(tmp_path / "dense.ply", files[1])
+    sensor_files.write(tmp_path / "sensor.json", TRUTH)
+    assert command("view", "in.npz", "dense.ply", "--from", "sensor.json")[0] == 0
+    first, second, *_ = scene(tmp_path / "view.html")["clouds"]
+    assert (first["count"], second["count"]) == tuple(int((scan.ranges > 0).sum()) for scan in files[:2])
 
 
 def test_one_file_alone(command, files, tmp_path):
