@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 
-__all__ = ["LIMIT", "TooLarge", "check", "limited"]
+__all__ = ["LIMIT", "TooLarge", "check", "limit", "limited", "ran_out"]
 
 LIMIT = 2_000_000_000
 """The limit by default [bytes]."""
@@ -23,8 +23,19 @@ def check(what: str, needed: int) -> None:
         needed: About how much [bytes].
     """
     if needed > _limit:
-        amount = f"{needed / 1e9:.3g} GB" if needed < 1e18 else "more than a billion GB"
-        raise TooLarge(f"{what} would take about {amount} of memory; the limit is {_limit / 1e9:g} GB")
+        amount = f"about {needed / 1e9:.3g} GB" if needed < 1e18 else "more than a billion GB"
+        raise TooLarge(f"{what} would take {amount} of memory; the limit is {_limit / 1e9:g} GB")
+
+
+def ran_out(error: BaseException) -> bool:
+    """Returns whether an error says that there is not enough memory, in Python's words or in torch's."""
+    says = "can't allocate memory" in str(error) or type(error).__name__ == "OutOfMemoryError"
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and says)
+
+
+def limit() -> float:
+    """Returns the limit of this process [bytes]."""
+    return _limit
 
 
 @contextlib.contextmanager

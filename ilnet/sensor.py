@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ilnet import memory
 from ilnet.sensors import TABLES, Table
 from ilnet.sensors.table import FALLING, RISING
 
@@ -49,6 +50,10 @@ def directions_to_angles(directions: torch.Tensor) -> tuple[torch.Tensor, torch.
     """Returns elevation and azimuth (...) [rad] of vectors (..., 3) of any length, in the sensor frame."""
     x, y, z = directions.unbind(-1)
     return torch.atan2(z, torch.hypot(x, y)), torch.atan2(y, x)
+
+
+# About how much memory a ray takes when its scan is predicted or simulated [bytes].
+_PER_RAY = 100
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -329,10 +334,11 @@ class Sensor:
         The outermost beams stay. A full circle keeps its first column; a partial one its first and last.
 
         Raises:
-            ValueError: If `rows` or `columns` is below 2.
+            ValueError: If `rows` or `columns` is below 2, or such a scan would take too much memory.
         """
         if rows < 2 or columns < 2:
             raise ValueError(f"rows and columns are {rows} and {columns}; each should be at least 2")
+        memory.check(f"a scan of {format_size((rows, columns))} rays", rows * columns * _PER_RAY)
         first, last = self.azimuths[0], self.azimuths[-1]
         if self.wrap:
             turn = math.copysign(math.tau, last - first)

@@ -9,6 +9,8 @@ from typing import Any
 
 import click
 
+from ilnet import memory
+
 __all__ = ["main"]
 
 _SIZES = "16x1024,64x1024,128x2048,256x4096"
@@ -46,6 +48,22 @@ class _Size(click.ParamType):
             self.fail(str(error), parameter, context)
 
 
+def _limit_memory(context: click.Context, parameter: click.Parameter, value: float) -> None:
+    context.with_resource(memory.limited(value * 1e9))
+
+
+_max_memory = click.option(
+    "--max-memory",
+    type=click.FloatRange(min=0, min_open=True),
+    default=memory.LIMIT / 1e9,
+    show_default=True,
+    metavar="GB",
+    expose_value=False,
+    callback=_limit_memory,
+    help="Refuse a file or a size that would take more memory.",
+)
+
+
 # Commands import what they need when they run, so that `--help` and a mistyped option answer at once.
 
 
@@ -67,6 +85,7 @@ def cli(context: click.Context) -> None:
 )
 @click.option("--out", type=Path, default=Path("demo_output"), show_default=True, help="Folder for the pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of the table.")
+@_max_memory
 def demo(
     mesh: Path | None,
     at: tuple[float, float, float] | None,
@@ -194,6 +213,7 @@ def train(
 @click.option(
     "--json", "as_json", is_flag=True, help="Print an object instead of the table, or a list for many models."
 )
+@_max_memory
 def evaluate(
     files: tuple[Path, ...],
     names: tuple[str, ...],
@@ -345,6 +365,12 @@ def _json(value: Any) -> str:
     metavar="NAME|FILE",
     help="Preset or table with the angles of IN, if its files do not hold them.",
 )
+@click.option(
+    "--columns",
+    type=click.IntRange(3, 6),
+    metavar="N",
+    help="Columns of the points in .bin files; told by their values by default.",
+)
 @click.option("--topic", metavar="NAME", help="Topic of the clouds in a bag, where there are several.")
 @click.option("--metadata", type=Path, metavar="FILE", help="Metadata (JSON) of the Ouster sensor of a capture.")
 @click.option(
@@ -357,7 +383,7 @@ def _json(value: Any) -> str:
 @click.option(
     "--format",
     "suffix",
-    type=click.Choice(["npz", "ply", "pcd"]),
+    type=click.Choice(["npz", "ply", "pcd", "laz", "bin"]),
     help="Format of the files in a folder OUT; npz by default.",
 )
 @click.option(
@@ -366,6 +392,7 @@ def _json(value: Any) -> str:
     metavar="P",
     help="Drop returns that are right to 10 cm with a probability below P, 0 to 1, by a model that tells it.",
 )
+@_max_memory
 @click.pass_context
 def upsample(
     context: click.Context,
@@ -375,6 +402,7 @@ def upsample(
     sensor: str | None,
     name: str,
     origin: str | None,
+    columns: int | None,
     topic: str | None,
     metadata: Path | None,
     precision: str,
@@ -399,7 +427,7 @@ def upsample(
         dense = recordings.Densifier(model, target, precision, min_confidence)
         written, failed = recordings.run(source, out, dense, measured, topic, metadata, ending)
     else:
-        written, failed = upsample.run(source, out, model, target, measured, ending, min_confidence)
+        written, failed = upsample.run(source, out, model, target, measured, ending, min_confidence, columns)
     if written:
         click.echo(f"{written} scan(s) written to {out}" + (f", {failed} could not be: see above" if failed else ""))
     if failed:
@@ -520,6 +548,7 @@ def view(files: tuple[Path, ...], origin: str | None, out: Path) -> None:
 )
 @click.option("--workers", type=click.IntRange(min=1), metavar="N", help="Processes on a CPU; one per core by default.")
 @click.option("--out", type=Path, required=True, help="Folder of the archive; an interrupted run goes on there.")
+@_max_memory
 def simulate(
     towns: str | None,
     mesh: Path | None,
@@ -591,6 +620,7 @@ def bench(sections: tuple[str, ...], as_json: bool) -> None:
 @click.option("--town", "towns", multiple=True, metavar="NAME", help="A town, or `all`; may be repeated.")
 @click.option("--out", type=Path, default=Path("survey_output"), show_default=True, help="Folder for the figure.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON list instead of the table.")
+@_max_memory
 def survey(
     scans: tuple[Path, ...],
     meshes: tuple[Path, ...],
@@ -791,7 +821,11 @@ def main() -> None:
         message = error.format_message()
     except (click.Abort, KeyboardInterrupt):
         sys.exit(130)
-    except (ValueError, OSError) as error:
-        message = str(error)
+    except (ValueError, OSError, MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and not memory.ran_out(error):
+            raise
+        from ilnet.commands import options
+
+        message = options.error_line(error)
     click.echo("error: " + " ".join(message.split()), err=True)
     sys.exit(2)

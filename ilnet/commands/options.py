@@ -4,11 +4,12 @@ from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any
 
+from ilnet import memory
 from ilnet.sensor import PAPER_INPUT, PRESETS, Sensor, parse_size
 from ilnet.world.effects import Effects
 from ilnet.world.towns import NAMES
 
-__all__ = ["effects", "sensors", "towns"]
+__all__ = ["effects", "error_line", "sensors", "towns"]
 
 # Those that show in ranges, which are all that an archive holds.
 _EFFECTS = tuple(field.name for field in fields(Effects) if field.name != "intensity")
@@ -38,6 +39,16 @@ def sensors(text: str) -> list[Sensor]:
             raise ValueError(f"--sizes: {error}") from None
         found.append(PRESETS.get(f"paper-{size}") or PAPER_INPUT.resize(*shape))
     return found
+
+
+def error_line(error: BaseException) -> str:
+    """Returns one line on an error, with the option that helps where there is one."""
+    line = " ".join(str(error).split())
+    if memory.ran_out(error):
+        return f"there is not enough memory: {line or 'try a smaller size'}"
+    if isinstance(error, memory.TooLarge) or isinstance(error.__cause__, memory.TooLarge):
+        line += ": --max-memory GB"
+    return line
 
 
 def effects(settings: Iterable[str]) -> Effects | None:

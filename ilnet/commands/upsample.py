@@ -6,7 +6,8 @@ from pathlib import Path
 
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from ilnet import models, scan_files
+from ilnet import memory, models, scan_files
+from ilnet.commands import options
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor
 from ilnet.world import simulate
@@ -22,11 +23,12 @@ def run(
     sensor: Sensor | None = None,
     suffix: str = ".npz",
     min_confidence: float | None = None,
+    columns: int | None = None,
 ) -> tuple[int, int]:
     """Upsamples a file, or all files of a folder, with a progress bar on stderr.
 
     A file that cannot be upsampled becomes one line on stderr, and the others are upsampled all the same. Each file is
-    written whole or not at all.
+    written whole or not at all; what an earlier run left unfinished, because it was killed, is removed.
 
     Args:
         source: A file that `ilnet.scan_files.read` reads, or a folder of such files. Folders and hidden files in it are
@@ -38,6 +40,7 @@ def run(
         sensor: The sensor of the files, if they do not hold its angles; see `ilnet.scan_files.read`.
         suffix: Suffix of the files written to a folder.
         min_confidence: Returns of less confidence become no return; None keeps all.
+        columns: How many columns the points of a `.bin` have; None tells it by the values.
 
     Returns:
         The numbers of files that were written and that could not be.
@@ -55,13 +58,16 @@ def run(
     model = model.to(device)
     frames: models.Upsampler | None = None
     tasks = list(_tasks(source, out, suffix))
+    folder = tasks[0][1].parent
+    if folder.is_dir():
+        scan_files.remove_unfinished(folder)
     written: set[Path] = set()
     failed = 0
     for path, result in tqdm(tasks, unit="scan", desc="upsample"):
         try:
             if result in written:
                 raise ValueError(f"{path}: another file of this name became {result} already; rename one of them")
-            scan = scan_files.read(path, sensor).to(device)
+            scan = scan_files.read(path, sensor, columns).to(device)
             if frames is None or frames.source != scan.sensor:
                 wanted = target if isinstance(target, Sensor) else scan.sensor.resize(*target)
                 frames = models.Upsampler(model, scan.sensor, wanted, device=device)
@@ -70,9 +76,11 @@ def run(
                 dense = _confident(dense, min_confidence)
             scan_files.write(result, dense)
             written.add(result)
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, MemoryError, RuntimeError) as error:
+            if isinstance(error, RuntimeError) and not memory.ran_out(error):
+                raise
             failed += 1
-            line = " ".join(str(error).split())
+            line = options.error_line(error)
             if isinstance(error.__cause__, scan_files.UnknownSensor):
                 line += ": --from NAME"
             tqdm.write(f"error: {line if line.startswith(str(path)) else f'{path}: {line}'}", file=sys.stderr)

@@ -28,6 +28,7 @@ import numpy as np
 import torch
 from tqdm import tqdm  # type: ignore[import-untyped]
 
+from ilnet import memory
 from ilnet.data.archive import UNIT, Archive
 from ilnet.sensor import Sensor
 from ilnet.world import meshes, places, simulate, towns
@@ -41,6 +42,10 @@ T = TypeVar("T")
 
 # The ground must lie at most this many metres below the sensor.
 _GROUND_WITHIN = 20.0
+
+
+# About how much memory the place and the pose of a scan take [bytes].
+_PER_SCAN = 300
 
 
 class Recipe(NamedTuple):
@@ -135,6 +140,7 @@ def generate(
         OSError: If the folder cannot be written, or a worker died.
         ValueError: If an argument does not fit, or `out` holds another archive.
     """
+    memory.check(f"the list of {scans} scans", scans * _PER_SCAN)
     sizes: dict[str, Sensor] = {}
     for sensor in sensors:
         if sensor.size in sizes:

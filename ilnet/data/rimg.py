@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ilnet import memory
 from ilnet.scan import Scan
 from ilnet.sensor import Sensor, format_size
 
@@ -28,6 +29,8 @@ _SPECIFICATION = "lidar_specification.yaml"
 _KEYS = ("min_v", "max_v", "min_h", "max_h", "min_r", "max_r", "norm_r")
 _NAME = re.compile(r"\d+_\d+/\d+\.rimg")
 _HEADER = 16
+# About how much memory a ray takes when it is read [bytes].
+_PER_RAY = 20
 
 
 class RangeImageTree:
@@ -80,6 +83,7 @@ class RangeImageTree:
         return values
 
     def _specified(self, rows: int, columns: int) -> Sensor:
+        memory.check(f"{self.path}: a scan of {format_size((rows, columns))} rays", rows * columns * _PER_RAY)
         of = self._specification
         elevations = np.deg2rad(np.linspace(of["min_v"], of["max_v"], rows))
         azimuths = math.pi / 2 - np.deg2rad(np.linspace(of["min_h"], of["max_h"], columns, endpoint=False))

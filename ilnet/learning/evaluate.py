@@ -12,7 +12,7 @@ import numpy as np
 from scipy import stats
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from ilnet import data, models, scan_files, sensor_files
+from ilnet import data, memory, models, scan_files, sensor_files
 from ilnet.data import Archive, RangeImageTree
 from ilnet.learning import metrics
 from ilnet.scan import Pair
@@ -34,6 +34,9 @@ __all__ = [
 # The figures of the paper, and those that tell whether edges stay sharp.
 _FIGURES = ("mae", "iou", "precision", "recall", "f1", "floating", "edge_mae", "chamfer")
 
+# The memory that a ray of a scan takes [bytes].
+_PER_RAY = 4
+
 
 def town_pairs(name: str, count: int, output: Sensor, source: Sensor = PAPER_INPUT) -> list[Pair]:
     """Scans a town at evenly spread waypoints, each with its own traffic.
@@ -48,8 +51,10 @@ def town_pairs(name: str, count: int, output: Sensor, source: Sensor = PAPER_INP
         For each waypoint the scan of `source` and that of `output`.
 
     Raises:
-        ValueError: If there is no such town.
+        ValueError: If there is no such town, or so many scans would take too much memory.
     """
+    rays = sum(math.prod(sensor.shape) for sensor in (source, output))
+    memory.check(f"{count} pairs of scans", count * rays * _PER_RAY)
     place = places.town(name, device=simulate.best_device())
     return [(scan, truth) for scan, truth in places.held_out_scans(place, count, [source, output])]
 

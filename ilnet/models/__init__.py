@@ -1,6 +1,7 @@
 """The models by name: made untrained, or loaded from a file of weights."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
+from ilnet import memory
 from ilnet.models import authors
 from ilnet.models.base import PRECISIONS, Answer, Model, Upsampler, returns
 from ilnet.models.bilinear import Bilinear, Nearest, Planes
@@ -117,16 +119,20 @@ def load(name: str | Path) -> Model:
         )
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file of weights")
+    memory.check(str(path), 3 * path.stat().st_size)
     if path.suffix == ".pth":
         kind, arguments, state = authors.read(path)
         falling = True
     else:
         kind, arguments, state, falling = _read(path)
     try:
+        _check_arguments(arguments, state)
+        with torch.device("meta"):  # takes no memory, whatever the arguments ask for
+            _check_shapes(create(kind, **arguments), state)
         model = create(kind, **arguments)
-        _fill(model, state)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"{path}: not weights of {kind} with {arguments} ({error})") from error
+        model.load_state_dict(state)
+    except (TypeError, ValueError, RuntimeError, ArithmeticError) as error:
+        raise ValueError(f"{path}: not weights of {kind!s:.80} ({_line(error)})") from error
     model.falling = falling
     return model.eval()
 
@@ -143,13 +149,35 @@ def card(name: str | Path) -> dict[str, Any]:
         return {key: json.loads(value) for key, value in file.metadata().items()}
 
 
-def _fill(model: Model, state: dict[str, torch.Tensor]) -> None:
-    """Loads parameters, or raises a ValueError of one line, where torch writes one for each parameter."""
+def _check_arguments(arguments: dict[str, Any], state: dict[str, Any]) -> None:
+    """Raises a ValueError unless the parameters can be those of a network with these arguments."""
+    # Layers and channels are at most as many as there are parameters, or values along an axis of one.
+    shapes = [getattr(value, "shape", ()) for value in state.values()]
+    most = max(len(state), *(max(shape, default=0) for shape in shapes), 0)
+    for name, value in arguments.items():
+        number = isinstance(value, int | float)
+        if name == "norm_range" and not (number and 0 < value < math.inf):
+            raise ValueError(f"norm_range is {value!s:.80}; it should be a number of metres above 0")
+        if not (number or isinstance(value, str)) or (isinstance(value, float) and not math.isfinite(value)):
+            raise ValueError(f"{name} is {value!s:.80}; it should be a finite number or a text")
+        if isinstance(value, int) and name != "norm_range" and value > most:
+            raise ValueError(f"{name} is {value!s:.80}; parameters of these shapes allow {most} at most")
+
+
+def _check_shapes(model: Model, state: dict[str, Any]) -> None:
+    """Raises a ValueError of one line, where torch writes one for each parameter; of NaN and infinite ones too."""
     shapes = [{key: getattr(value, "shape", None) for key, value in s.items()} for s in (model.state_dict(), state)]
     wrong = [key for key in sorted(shapes[0].keys() | shapes[1].keys()) if shapes[0].get(key) != shapes[1].get(key)]
     if wrong:
         raise ValueError(f"{len(wrong)} parameters are missing, unknown or of another shape, such as {wrong[0]}")
-    model.load_state_dict(state)
+    bad = [key for key, value in sorted(state.items()) if value.is_floating_point() and not value.isfinite().all()]
+    if bad:
+        raise ValueError(f"{len(bad)} parameters hold NaN or infinite values, such as {bad[0]}")
+
+
+def _line(error: BaseException) -> str:
+    """Returns an error as one short line."""
+    return f"{' '.join(str(error).split()):.300}"
 
 
 def _read(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.Tensor], bool]:
@@ -158,5 +186,5 @@ def _read(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.Tensor], boo
         with safe_open(path, "pt") as file:
             about = {key: json.loads(value) for key, value in (file.metadata() or {}).items()}
         return about["name"], dict(about["arguments"]), load_file(path), bool(about.get("falling"))
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not weights that `models.save` wrote ({error})") from error
+    except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not weights that `models.save` wrote ({_line(error)})") from error

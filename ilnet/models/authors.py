@@ -74,7 +74,7 @@ def read(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.Tensor]]:
         content = dict(checkpoint)
         model, norm_range = content["model"], float(content["lidar_in"]["norm_r"])
         theirs, given, state = str(model["name"]), dict(model["args"]), dict(model["state_dict"])
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise ValueError(f"{path}: not a checkpoint of the authors' code, which holds model and lidar_in") from error
     if theirs not in _MODELS:
         raise ValueError(f"{path}: its model is {theirs!r}; it should be one of {', '.join(_MODELS)}")
@@ -88,6 +88,8 @@ def read(path: Path) -> tuple[str, dict[str, Any], dict[str, torch.Tensor]]:
             arguments[ours] = value
         elif value != default:
             raise ValueError(f"{path}: its {theirs} has {key} = {value}; only {default} is known here")
+    if not all(isinstance(key, str) for key in state):
+        raise ValueError(f"{path}: its parameters have names that are no text; it is damaged")
     return name, arguments, {_rename(key): value for key, value in state.items()}
 
 

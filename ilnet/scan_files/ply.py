@@ -70,9 +70,12 @@ def read_points(path: Path) -> Points:
 
 
 def check_header(path: Path) -> None:
-    """Raises a ValueError, which continues "path: ", unless a file can hold the elements that its header promises."""
+    """Raises a ValueError, which continues "path: ", if a file is shorter than its header promises."""
     with path.open("rb") as file:
-        layout, elements = _header(file)
+        try:
+            layout, elements = _header(file)
+        except ValueError:  # another reader may know it
+            return
         there = os.fstat(file.fileno()).st_size - file.tell()
     least = sum(element.number * element.least(layout == "ascii") for element in elements)
     if least > there + 1:  # as above
