@@ -135,6 +135,7 @@ def demo(
     "iln-surfaces.",
 )
 @click.option("--out", type=Path, default=Path("runs"), show_default=True, help="Folder for weights, figures, logs.")
+@_max_memory
 def train(
     model: str,
     preset: str,
@@ -695,6 +696,7 @@ def towns(names: tuple[str, ...], out: Path) -> None:
     metavar="FILE|FOLDER",
     help="A measured scan, or all those in a folder; may be repeated.",
 )
+@_max_memory
 def experiment(
     names: tuple[str, ...],
     preset: str | None,

@@ -149,6 +149,10 @@ def card(name: str | Path) -> dict[str, Any]:
         return {key: json.loads(value) for key, value in file.metadata().items()}
 
 
+# The largest range that can stand for no return [m].
+_FARTHEST = 1e6
+
+
 def _check_arguments(arguments: dict[str, Any], state: dict[str, Any]) -> None:
     """Raises a ValueError unless the parameters can be those of a network with these arguments."""
     # Layers and channels are at most as many as there are parameters, or values along an axis of one.
@@ -156,7 +160,7 @@ def _check_arguments(arguments: dict[str, Any], state: dict[str, Any]) -> None:
     most = max(len(state), *(max(shape, default=0) for shape in shapes), 0)
     for name, value in arguments.items():
         number = isinstance(value, int | float)
-        if name == "norm_range" and not (number and 0 < value < math.inf):
+        if name == "norm_range" and not (number and 0 < value <= _FARTHEST):
             raise ValueError(f"norm_range is {value!s:.80}; it should be a number of metres above 0")
         if not (number or isinstance(value, str)) or (isinstance(value, float) and not math.isfinite(value)):
             raise ValueError(f"{name} is {value!s:.80}; it should be a finite number or a text")

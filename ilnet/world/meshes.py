@@ -41,7 +41,7 @@ def read(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     """
     path = Path(path)
     if not path.is_file():
-        what = "is a folder" if path.is_dir() else "there is no such file"
+        what = "is a folder, a pipe or a device" if path.exists() else "there is no such file"
         raise FileNotFoundError(f"{path}: {what}; it should be the path of a mesh")
     size = path.stat().st_size
     memory.check(str(path), size)

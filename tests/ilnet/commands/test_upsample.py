@@ -1,5 +1,7 @@
 """The command `upsample`, in this process."""
 
+import fcntl
+import os
 import re
 
 import numpy as np
@@ -122,6 +124,80 @@ def test_bad_input_is_one_line_and_exit_code_2(run, seen, tmp_path, arguments, m
     assert (code, out) == (2, "")
     assert message in error
     assert (tmp_path / "in.npz").read_bytes() == before
+
+
+def test_what_takes_too_much_memory_does_not_keep_the_others_from_being_done(run, seen, tmp_path):
+    (tmp_path / "in").mkdir()
+    for name in ("a", "c"):
+        scan_files.write(tmp_path / "in" / f"{name}.npz", seen)
+    (tmp_path / "in" / "b.bin").touch()
+    os.truncate(tmp_path / "in" / "b.bin", 3 << 30)
+    code, out, [error] = run("in", "out", "--size", "16x256", "--model", "nearest")
+    assert (code, out) == (2, "2 scan(s) written to out, 1 could not be: see above\n")
+    expected = "error: in/b.bin: it would take about 40.3 GB of memory; the limit is 2 GB: --max-memory GB"
+    assert error == expected
+    limit = ("--max-memory", "1e-5")
+    code, _, errors = run("in", "new", "--size", "16x256", "--model", "nearest", *limit)
+    assert code == 2
+    assert len(errors) == 3
+    assert errors[0].endswith("the limit is 1e-05 GB: --max-memory GB")
+
+
+@pytest.mark.parametrize(
+    "message", [None, "DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes."]
+)
+def test_memory_that_runs_out_ends_one_file(run, seen, tmp_path, monkeypatch, message):
+    (tmp_path / "in").mkdir()
+    for name in ("a", "b"):
+        scan_files.write(tmp_path / "in" / f"{name}.npz", seen)
+    called = []
+
+    def write(path, scan):
+        called.append(path)
+        if len(called) == 1:
+            raise RuntimeError(message) if message else MemoryError
+        path.write_text("whole")
+
+    monkeypatch.setattr(scan_files, "write", write)
+    code, out, [error] = run("in", "out", "--size", "16x256", "--model", "nearest")
+    assert (code, out) == (2, "1 scan(s) written to out, 1 could not be: see above\n")
+    assert error.startswith("error: in/a.npz: there is not enough memory: ")
+    assert (tmp_path / "out" / "b.npz").read_text() == "whole"
+
+
+@pytest.mark.parametrize("size", ["1000000000x1000000000", "1000000x1000000"])
+def test_an_absurd_size_is_one_line(run, seen, size):
+    code, out, [error] = run("in.npz", "out.npz", "--size", size, "--model", "nearest")
+    assert (code, out) == (2, "")
+    assert error.startswith(f"error: in.npz: a scan of {size} rays would take ")
+    assert error.endswith("of memory; the limit is 2 GB: --max-memory GB")
+
+
+def test_what_a_killed_run_left_unfinished_is_removed(run, seen, tmp_path):
+    (tmp_path / "out").mkdir()
+    killed = tmp_path / "out" / ".0123456789abcdef.ilnet-partial"
+    killed.write_bytes(b"half of it")
+    other = tmp_path / "out" / ".fedcba9876543210.ilnet-partial"
+    with other.open("wb") as file:  # that of a run that is still at it
+        file.write(b"half of it")
+        file.flush()
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert run("in.npz", "out/a.npz", "--size", "16x256", "--model", "nearest")[0] == 0
+        assert not killed.exists()
+        assert other.exists()
+
+
+def test_the_number_of_columns_can_be_given(run, tmp_path):
+    sensor = preset("paper-16x1024")
+    rng = np.random.default_rng(0)
+    table = np.concatenate([Scan(5 + 9 * torch.rand(sensor.shape), sensor).points().numpy()], axis=1)
+    np.concatenate((table, rng.random((len(table), 3))), axis=1).astype("<f4").tofile(tmp_path / "a.bin")
+    options = ("--size", "16x256", "--model", "nearest", "--from", "paper-16x1024")
+    assert run("a.bin", "a.npz", *options, "--columns", 6)[0] == 0
+    assert (scan_files.read(tmp_path / "a.npz").ranges > 0).all()
+    code, _, [error] = run("a.bin", "b.npz", *options, "--columns", 7)
+    assert code == 2
+    assert "--columns" in error
 
 
 @pytest.fixture
