@@ -152,7 +152,7 @@ def bad_files(folder):
     write_scan(folder / "zeros.npz", rows * 0)
     write_scan(folder / "one_beam.npz", rows[:1])
     write_scan(folder / "good.npz", rows)
-    write_scan(folder / "millimetres.npz", np.full((32, 64), 20_000.0))
+    write_scan(folder / "micrometres.npz", np.full((32, 64), 2e7))
     (folder / "at.json").write_text('{"positions": [[0, 0, 1.8]]}')
     (folder / "far.json").write_text('{"positions": [[0, 0, 1.8], [900, 0, 1.8]]}')
     (folder / "flat.json").write_text('{"positions": [[0, 1.8]]}')
@@ -187,7 +187,7 @@ BAD = {
     "one row": (["demo", "--scan", "good.npz", "--rows", "1"], "; it should be 2 to 8"),
     "all rows": (["demo", "--scan", "good.npz", "--rows", "8"], "keep fewer"),
     "no rows without a scan": (["demo", "--rows", "0"], "--rows and --sensor go with --scan"),
-    "millimetres": (["demo", "--scan", "millimetres.npz"], "are these metres?"),
+    "micrometres": (["demo", "--scan", "micrometres.npz"], "neither metres nor millimetres"),
     "folder as mesh": (["demo", "--mesh", ".", "--at", "0", "0", "0"], "is a folder"),
     "points without sensor": (
         ["demo", "--scan", "points.ply"],
