@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ilnet.learning import evaluate, metrics, train
-    from ilnet.world import effects, meshes, places, simulate, towns
+    from ilnet.world import effects, meshes, places, rosette, simulate, towns
 
-__all__ = ["effects", "evaluate", "meshes", "metrics", "places", "simulate", "towns", "train"]
+__all__ = ["effects", "evaluate", "meshes", "metrics", "places", "rosette", "simulate", "towns", "train"]
 
 _ROOMS = {
     "learning": ("evaluate", "metrics", "train"),
-    "world": ("effects", "meshes", "places", "simulate", "towns"),
+    "world": ("effects", "meshes", "places", "rosette", "simulate", "towns"),
 }
 
 
