@@ -51,7 +51,7 @@ _CONVERGING = {"liif": "--", "iln": "-", "iln-surfaces": "-."}
 
 
 def table(study: Study) -> None:
-    """The paper's Table II: all methods at three sizes; on a tree of the paper's authors, at each of its sizes."""
+    """The paper's Table II: all methods at three sizes."""
     rules: dict[str, str | Path] = {name: name for name in ("nearest", "bilinear", "bilinear-inverse", "planes")}
     archive = data.open_archive(study.archive) if study.archive else None
     if isinstance(archive, data.RangeImageTree):
@@ -77,12 +77,14 @@ def table(study: Study) -> None:
 
 
 def _table_of_tree(study: Study, tree: Path, files: Mapping[str, str | Path]) -> None:
+    """The same on a tree of the paper's authors, at each of its sizes."""
     compared, rows = loaded(files), []
     for pairs in evaluate.stored_pairs(tree, count=study.stored_scans):
         for row in evaluate.measure(compared, pairs):
             # A checkpoint of the authors has no card.
             about = {} if str(row["model"]).endswith(".pth") else models.card(files[row["model"]])
-            rows.append(row | {key: about.get(key, "") for key in ("steps", "minutes")})
+            trained = {key: about.get(key, "") for key in ("steps", "minutes")}
+            rows.append({**row, "input": pairs.sizes[0], **trained})
     study.write("table", rows)
     _draw_table(study, rows)
 
@@ -291,9 +293,8 @@ def results(study: Study) -> Path:
         for part in (part for part in made if part.startswith(f"{name}-")):
             lines += ["", f"### {part}", "", f"![{part}]({part}.png)", ""]
             lines += _markdown(_read(study.out / f"{part}.csv"))
-        if name == "table":
-            drawn = [town for town in towns.TEST if (study.out / f"points-{town}.png").exists()]
-            lines += ["", *(f"![The same crop by every method, {town}](points-{town}.png)" for town in drawn)]
+        if name == "table" and "input" not in rows[0]:  # a tree has no test towns
+            lines += ["", *(f"![The same crop by every method, {town}](points-{town}.png)" for town in towns.TEST)]
     page = study.out / "RESULTS.md"
     page.write_text("\n".join(lines).rstrip() + "\n")
     return page
