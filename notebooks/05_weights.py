@@ -13,43 +13,45 @@
 # %% [markdown]
 # # 05 · Weights
 #
-# ![Left, the answers of three networks for queries on the way from one column to the next, across an edge. Right, the
-# weights of one of the three for the four neighbours, as stacked bands](pictures/05_weights.png)
+# ![A wall and a car in a range image: the truth, and what three networks answer untrained, after 30 and after 120
+# steps](pictures/05_weights.png)
 #
-# **Goal.** You change one branch of the network of notebook 04, so that it predicts *weights* instead of values, train
-# both on the same rays, and look at the same edge again.
+# **Goal.** You write the one branch in which three networks differ: they predict *values*, *corrections* or *weights*.
+# You train each of them three times on the same rays, and see which part of the lead comes from what.
 #
 # **After this notebook you can**
 #
 # - write equation 3 of the paper, and say why its answer never leaves the span of the neighbours;
 # - derive the gradient that teaches it, and say what it spends its training on;
-# - show with your own training that weights are learned faster than values;
+# - tell what measured ranges are worth from what weights are worth, by your own runs;
 # - start a network from a formula instead of from nothing.
 #
 # | | |
 # |---|---|
 # | You know | [04 · Values](04_values.ipynb) |
-# | Time | 30 minutes, and 20 for the exercises; one to two minutes to run |
+# | Time | 35 minutes, and 35 for the exercises; two to three minutes to run |
 # | Hardware | any computer; a CUDA GPU is used if there is one |
 
 # %%
-from itertools import islice
-
 import matplotlib.pyplot as plt
+import numpy as np
 import torch
 from torch import nn
 
-from ilnet import data, metrics, models, places
-from ilnet.course import check, slide
+from ilnet import metrics, models
+from ilnet.commands import fair
+from ilnet.course import check, fit, held_out, slide, yours_or
 from ilnet.models.encoder import Encoder
-from ilnet.sensor import preset
+from ilnet.sensor import PAPER_INPUT as SENSOR
 from kernels import area_blend, gather_blend, gather_neighbours
 
 FAST = True  # False: ten times the steps
 STEPS = 120 if FAST else 1200
-torch.manual_seed(0)
+SEEDS = 3
 device = "cuda" if torch.cuda.is_available() else "cpu"
-COLOURS = {"values (LIIF)": "#d55e00", "weights, the same MLP": "#cc79a7", "weights (ILN)": "#0072b2"}
+KINDS = "values", "corrections", "weights"
+COLOURS = dict(zip(KINDS, ("#d55e00", "#e69f00", "#0072b2"), strict=True))
+MARKS = dict(zip(KINDS, "vso", strict=True))
 
 # %% [markdown]
 # ## 1. Another question
@@ -77,7 +79,7 @@ COLOURS = {"values (LIIF)": "#d55e00", "weights, the same MLP": "#cc79a7", "weig
 #
 # ### Exercise 1 · Softmax and blend
 #
-# ★☆☆ · 5 minutes
+# importance ★★★ · difficulty ★☆☆ · 5 minutes
 #
 # Write `softmax_blend(r, s)`: ranges r (Q, 4) weighted by the softmax of scores s (Q, 4), with `exp` and not with
 # `softmax`. Scores may be as large as 1000: `exp(1000)` is infinite, so something has to be done first that does not
@@ -159,9 +161,7 @@ def softmax_blend(r, s):
 # neighbours agree to 10 cm, is the error larger or smaller than 10 cm, and why?
 
 # %%
-SENSOR = preset("paper-16x1024")
-pairs = places.held_out_scans(places.town("town05", device=device), 1, [SENSOR, preset("paper-64x1024")])
-scan, truth = pairs[0]
+scan, truth = held_out()  # the scan of notebook 04
 image = scan.filled()[None]  # (1, 16, 1024)
 queries = SENSOR.grid_queries(truth.sensor).view(1, -1, 2).to(device)  # every pixel of the 64 x 1024 image
 r = gather_neighbours(image[:, None], queries)[0][0, ..., 0]  # (Q, 4)
@@ -181,16 +181,117 @@ assert (blended - true)[agree].abs().median() < 0.1
 #
 # ## 3. One branch
 #
-# Both networks from the same parts. What differs is the branch at the end.
+# From equation 2 to equation 3 *two* things change. The measured ranges $r_t$ enter the answer, and the network says
+# how to weigh them. Which of the two helps? A third kind of answer has the first without the second. It keeps the
+# areas $a_t$ as weights, and predicts what to *add* to each measured range:
+#
+# | kind | answer | measured ranges | weights |
+# |---|---|---|---|
+# | values | $\sum_t a_t\,(h_t + 1)\,R/2$ | no | areas |
+# | corrections | $\sum_t a_t\,(r_t + h_t\,R/2)$ | yes | areas |
+# | weights | $\sum_t \operatorname{softmax}(h)_t\; r_t$ | yes | predicted |
+#
+# $h_t$ is the one number that the network says for each neighbour, and $R$ = 100 m is the range that it sees as 1.
+#
+# ### Exercise 2 · The branch
+#
+# importance ★★★ · difficulty ★★☆ · 10 minutes
+#
+# Write `answer(kind, h, image, queries, wrap)`: the ranges (B, Q) [m] of all three kinds, from h (B, Q, 4), the measured
+# image (B, H, W) [m] and the queries (B, Q, 2). This is *the* difference between the networks below: as soon as you have
+# written it, they use yours.
+#
+# <details><summary>Hint</summary>
+#
+# `gather_neighbours(image[:, None], queries, wrap)[0][..., 0]` are the measured ranges (B, Q, 4).
+# </details>
+# <details><summary>Hint</summary>
+#
+# `area_blend(x, queries)` is $\sum_t a_t x_t$, and `gather_blend(image, queries, h, "none", wrap)` is equation 3.
+# </details>
+
+
+# %% tags=["exercise"]
+def answer(kind, h, image, queries, wrap):
+    raise NotImplementedError
+
+
+# %% tags=["solution"]
+def answer(kind, h, image, queries, wrap):
+    if kind == "values":
+        return area_blend((h + 1) * 50, queries)
+    if kind == "corrections":
+        measured = gather_neighbours(image[:, None], queries, wrap)[0][..., 0]
+        return area_blend(measured + h * 50, queries)
+    return gather_blend(image, queries, h, "none", wrap)
+
+
+# %% tags=["check"]
+@check
+def _():
+    generator = torch.Generator().manual_seed(0)
+    picture = 10 + 20 * torch.rand(2, 4, 6, generator=generator)
+    asked = torch.rand(2, 9, 2, generator=generator) * torch.tensor([3.0, 5.0])
+    h = torch.randn(2, 9, 4, generator=generator) / 10
+    zero = torch.zeros_like(h)
+    blend = gather_blend(picture, asked, zero, "bilinear", False)
+    value = answer("values", zero, picture, asked, False)
+    assert value.shape == (2, 9), f"one range for each query: (2, 9), not {tuple(value.shape)}"
+    assert torch.allclose(value, torch.full((2, 9), 50.0)), (
+        f"h = 0 is half of 100 m as a value, not {value[0, 0]:.1f} m"
+    )
+    corrected = answer("corrections", zero, picture, asked, False)
+    assert torch.allclose(corrected, blend, atol=1e-3), (
+        f"corrections of 0 leave bilinear interpolation, {blend[0, 0]:.2f} m; you have {corrected[0, 0]:.2f} m"
+    )
+    assert torch.allclose(answer("corrections", zero + 0.1, picture, asked, False), blend + 5, atol=1e-3), (
+        "a correction of 0.1 at all neighbours adds 5 m: it is in units of R/2"
+    )
+    weighed = answer("weights", zero, picture, asked, False)
+    mean = gather_neighbours(picture[:, None], asked, False)[0][..., 0].mean(-1)
+    assert torch.allclose(weighed, mean, atol=1e-3), "scores of 0 weigh the four neighbours equally"
+    for kind in KINDS:
+        mine, wanted = (function(kind, h, picture, asked, False) for function in (answer, fair.answer))
+        assert torch.allclose(mine, wanted, atol=1e-3), (
+            f"{kind}: {wanted[0, 0]:.2f} m is wanted, not {mine[0, 0]:.2f} m"
+        )
+    seam = torch.tensor([[[1.0, 5.5]], [[2.0, 5.5]]])
+    for kind in KINDS:
+        mine, wanted = (function(kind, zero[:, :1], picture, seam, True) for function in (answer, fair.answer))
+        assert torch.allclose(mine, wanted, atol=1e-3), f"{kind}: beside the last column lies the first; is wrap used?"
+
+
+# %% tags=["wrong"]
+def answer(kind, h, image, queries, wrap):  # corrections in metres
+    if kind == "corrections":
+        return area_blend(gather_neighbours(image[:, None], queries, wrap)[0][..., 0] + h, queries)
+    return fair.answer(kind, h, image, queries, wrap)
+
+
+# %% tags=["wrong"]
+def answer(kind, h, image, queries, wrap):  # scores beside a prior
+    if kind == "weights":
+        return gather_blend(image, queries, h, "bilinear", wrap)
+    return fair.answer(kind, h, image, queries, wrap)
+
+
+# %% tags=["wrong"]
+def answer(kind, h, image, queries, wrap):  # no seam
+    return fair.answer(kind, h, image, queries, False)
+
+
+# %% [markdown]
+# All three networks from the same parts: encoder and MLP of notebook 04, a little narrower so that nine trainings take
+# a minute or two.
 
 
 # %%
 class Network(nn.Module):
-    """Encoder and MLP of notebook 04; answers with values or with weights."""
+    """Ranges [m] of queries (B, Q, 2) in images (B, H, W) [m], as values, corrections or weights."""
 
-    def __init__(self, weights, features=64, hidden=256, norm_range=100.0):
+    def __init__(self, kind, features=32, hidden=64):
         super().__init__()
-        self.weights, self.norm_range = weights, norm_range
+        self.kind = kind
         self.encoder = Encoder(features, blocks=4)
         layers = [nn.Linear(features + 2, hidden), nn.ReLU()]
         for _ in range(3):
@@ -199,28 +300,19 @@ class Network(nn.Module):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
         self.h = nn.Sequential(*layers, nn.Linear(hidden, 1))
 
-    def forward(self, image, queries, wrap=True):
-        features = self.encoder(image[:, None] * (2 / self.norm_range) - 1, wrap)
+    def predict(self, image, queries, wrap):
+        features = self.encoder(image[:, None] / 50 - 1, wrap)
         z, offsets = gather_neighbours(features, queries, wrap)
-        said = self.h(torch.cat((z, offsets), -1)).squeeze(-1)  # (B, Q, 4)
-        if self.weights:  # they are scores: softmax, and blend what was measured
-            return gather_blend(image, queries, said, "none", wrap)
-        return (area_blend(said, queries) + 1) * (self.norm_range / 2)  # they are values: blend them by area
+        return self.h(torch.cat((z, offsets), -1)).squeeze(-1)  # h_t: (B, Q, 4)
+
+    def forward(self, image, queries, wrap=True):
+        h = self.predict(image, queries, wrap)
+        return yours_or(fair.answer, answer)(self.kind, h, image, queries, wrap)
 
 
-torch.manual_seed(0)
-networks = {
-    "values (LIIF)": Network(weights=False),
-    "weights, the same MLP": Network(weights=True),
-    "weights (ILN)": models.create("iln", blocks=4),
-}
-for name, network in networks.items():
-    print(f"{name:>22}: {sum(p.numel() for p in network.parameters()):,} parameters")
+print(f"{sum(p.numel() for p in Network('weights').parameters()):,} parameters each")
 
 # %% [markdown]
-# The third is the paper's network: instead of the MLP, the four neighbours first look at one another (*attention*,
-# notebook 07). It has fewer parameters.
-#
 # ## 4. What teaches it
 #
 # Learning follows gradients. How does the answer move if a score moves? With $w_t = e^{s_t} / \sum_u e^{s_u}$ we have
@@ -228,9 +320,9 @@ for name, network in networks.items():
 #
 # $$\frac{\partial \hat r}{\partial s_t} = \sum_u r_u\, w_u (\delta_{ut} - w_t) = w_t\,(r_t - \hat r)$$
 #
-# ### Exercise 2 · The gradient of a score
+# ### Exercise 3 · The gradient of a score
 #
-# ★☆☆ · 5 minutes
+# importance ★★★ · difficulty ★☆☆ · 5 minutes
 #
 # Write `score_gradient(r, s)` (Q, 4): the derivative of the blend by each score, from this formula and not by autograd.
 #
@@ -288,106 +380,118 @@ def score_gradient(r, s):
 # Read it: a score is moved in proportion to its weight and to how far its neighbour is from the answer. **Where
 # neighbours agree the gradient is zero**: a wall that faces the sensor teaches nothing, because nothing is left to
 # learn there. The training goes to places where neighbours differ: to edges first, but also to the road and to slanted
-# walls, where neighbours are metres apart and the right blend of them is to be found. (Section 7 gives those away for
-# nothing.) LIIF's gradient, $\partial \hat r / \partial h_t = S_t / S$ in the network's own units, is the same
-# everywhere.
+# walls, where neighbours are metres apart and the right blend of them is to be found. A value and a correction have the
+# gradient $a_t R/2$ everywhere, on the wall as at the edge.
 #
 # ## 5. The same budget
 #
-# The same rays, the same steps, the same optimiser, for all three.
+# `fit` is the loop of notebook 04: the same rays, steps and settings for all. Each kind is trained from three seeds.
 #
-# **Predict:** who will be ahead in IoU in the end, and how will they do against bilinear interpolation (0.40 in
-# notebook 04)?
+# **Predict:** in which order will they end in IoU? Will corrections be nearer to values or to weights?
+
 
 # %%
-streets = [places.town(name, device=device) for name in ("town01", "town02")]
-rays = data.ContinuousRays(streets, SENSOR, crops=4, columns=64, queries=384, seed=0)
-batches = list(islice(rays, STEPS))  # drawn once: all three see the very same
+def train(make, kinds=KINDS):
+    """Trains each kind from all seeds; returns the networks of seed 0 and what `fit` says of each."""
+    first, runs = {}, {}
+    for kind in kinds:
+        for seed in range(SEEDS):
+            torch.manual_seed(seed)
+            network = make(kind)
+            runs[kind, seed] = fit(network, STEPS, seed, looks=(0, STEPS // 4, STEPS))
+            first.setdefault(kind, network)
+    return first, runs
 
 
-@torch.no_grad()
-def judge(model):
-    """MAE [m], IoU and share of floating points on the held-out scan."""
-    found = metrics.ScanMetrics().to(device)
-    for scan, truth in pairs:
-        found.update(model(scan.filled()[None], queries).view(truth.ranges.shape), truth)
-    return {name: value.item() for name, value in found.compute().items()}
+def ends(runs, figure):
+    """Returns what each kind ends with: kind -> array of all seeds."""
+    kinds = dict.fromkeys(kind for kind, _ in runs)
+    return {kind: np.array([runs[kind, seed].curve[STEPS][figure] for seed in range(SEEDS)]) for kind in kinds}
 
 
-def train(model, steps, rate=1e-3, validations=4):
-    """Trains on rays at continuous directions; returns what `judge` said on the way, by step."""
-    optimizer = torch.optim.Adam(model.parameters(), rate)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, steps)
-    curve = {0: judge(model)}
-    for step, batch in enumerate(batches[:steps], start=1):
-        crops, asked, ranges = (t.to(device) for t in (batch.image, batch.queries, batch.ranges))
-        loss = (model(crops, asked, wrap=batch.wrap) - ranges).abs().mean()  # metres
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        if step % (steps // validations) == 0:
-            curve[step] = judge(model)
-    return curve
+def tell(runs):
+    iou, mae, floating = (ends(runs, figure) for figure in ("iou", "mae", "floating"))
+    for kind in iou:
+        print(
+            f"{kind:>11}: IoU {iou[kind].mean():.3f} ({iou[kind].min():.3f} to {iou[kind].max():.3f}), "
+            f"MAE {mae[kind].mean():.2f} m, floating {floating[kind].mean():.3f}"
+        )
 
 
-curves = {name: train(network.to(device), STEPS) for name, network in networks.items()}
-for name, curve in curves.items():
-    print(f"{name:>22}: MAE {curve[STEPS]['mae']:.2f} m, IoU {curve[STEPS]['iou']:.3f}")
-last = {name: curve[STEPS]["iou"] for name, curve in curves.items()}
-formula = judge(models.create("bilinear").to(device))["iou"]
-print(f"{'bilinear, untrained':>22}: IoU {formula:.3f}")
-print(f"\nIoU, ILN over LIIF: {last['weights (ILN)'] / last['values (LIIF)']:.1f}")
-print(f"IoU, the same MLP, weights over values: {last['weights, the same MLP'] / last['values (LIIF)']:.1f}")
-assert last["weights (ILN)"] > 1.2 * last["values (LIIF)"]
-assert last["weights, the same MLP"] > last["values (LIIF)"]
-assert curves["weights (ILN)"][STEPS]["mae"] < curves["values (LIIF)"][STEPS]["mae"]
+networks, scratch = train(Network)
 
 # %%
-figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.4), layout="constrained")
-left.axhline(formula, color="#999999", linestyle=":", label="bilinear, untrained")
-for (name, curve), style in zip(curves.items(), ("v-", "s--", "o-"), strict=True):
-    for axis, figure_name in ((left, "iou"), (right, "mae")):
-        axis.plot(list(curve), [point[figure_name] for point in curve.values()], style, color=COLOURS[name], label=name)
-left.set(xlabel="step", ylabel="IoU")
-right.set(xlabel="step", ylabel="MAE [m]", ylim=(0, 10))
-left.legend(frameon=False)
-plt.show()
+bilinear = metrics.compare(models.create("bilinear").to(device)(image, queries).view(truth.ranges.shape), truth)
+tell(scratch)
+iou = {kind: values.mean() for kind, values in ends(scratch, "iou").items()}
+print(f"\nIoU, weights over values:      {iou['weights'] / iou['values']:.1f}")
+print(f"IoU, weights over corrections: {iou['weights'] / iou['corrections']:.2f}")
+print(f"bilinear, without training: IoU {bilinear['iou']:.3f}, MAE {bilinear['mae']:.2f} m")
+assert iou["weights"] > iou["corrections"] > iou["values"]
+
+
+# %%
+def draw_curves(runs, highest):
+    """IoU and MAE over the steps: means over the seeds, and the bands between them."""
+    axes = plt.figure(figsize=(10, 3.4), layout="constrained").subplots(1, 2)
+    for axis, (figure, words) in zip(axes, (("iou", "IoU"), ("mae", "MAE [m]")), strict=True):
+        for kind in dict.fromkeys(kind for kind, _ in runs):
+            steps = list(runs[kind, 0].curve)
+            lines = np.array([[runs[kind, seed].curve[step][figure] for step in steps] for seed in range(SEEDS)])
+            axis.fill_between(steps, lines.min(0), lines.max(0), color=COLOURS[kind], alpha=0.2, linewidth=0)
+            axis.plot(steps, lines.mean(0), MARKS[kind] + "-", color=COLOURS[kind], label=kind)
+        axis.axhline(bilinear[figure], color="#777777", linestyle=":", label="bilinear, untrained")
+        axis.set(xlabel="step", ylabel=words)
+    axes[1].set_ylim(1.5, highest)
+    axes[0].legend(frameon=False)
+    plt.show()
+
+
+draw_curves(scratch, 6.0)
 
 # %% [markdown]
-# *In words: left, IoU over the step, with bilinear interpolation as a dotted line at 0.40. Both networks that predict
-# weights start at 0.14, untrained: the mean of the four neighbours. ILN climbs steeply to 0.28 in 60 steps and stays
-# there, the MLP climbs slowly; the network that predicts values stays close to zero. Right, the MAE: LIIF starts
-# outside of the picture and comes down towards the others' level late.*
+# *In words: left, IoU over the step. Weights start at 0.16, untrained, and end at 0.23; corrections climb from 0 to
+# 0.17, values to 0.07. The bands between the seeds do not overlap in the end, and bilinear interpolation, a dotted line
+# at 0.33, is above all of them. Right, the MAE: weights are below 2.5 m from the start; corrections come down to them,
+# and values last.*
 #
-# Weights are learned much faster than values. How much faster is hard to say from one run: LIIF's IoU depends on the
-# seed and lies between 0.01 and 0.09 here, so that the factor is anything from 3 to nearly 30. (The paper has 1.3 at
-# this size, after days of training.) And in so few steps ILN, too, is behind bilinear interpolation in IoU, though not
-# in MAE. Section 7 helps.
+# Weights are ahead of corrections, and corrections of values. So a part of the lead comes from the measured ranges that
+# enter the answer, and another part from weighing them. Do not read too much into the factors: this is a very short
+# training, and a factor over something close to zero is large by itself. Notebook 08 has the same comparison at a
+# longer budget, with either decoder, and there corrections come much closer.
 #
-# (The MLPs start from larger weights than PyTorch's own. To LIIF that makes no difference beyond that of another seed;
-# the MLP that says scores would have learned next to nothing in so few steps.)
+# ## 6. What they answer on the way
 #
-# ## 6. The same edge
-#
-# Which neighbour does ILN trust while a query walks across an edge? Its weights say it. The answer is linear in the
-# measured ranges, so $w_t = \partial \hat r / \partial r_t$: we get them by a derivative. (`encode` is the part of the
-# network that sees the image, `decode` the part that answers queries.)
-
+# **Predict:** which of the three shows a street before any training?
 
 # %% tags=["goal"]
-def weights_of(network, image, queries):
-    """The weights (Q, 4) of a network that was built with scores, by the derivative of its answer by the ranges."""
-    ranges = image.clone().requires_grad_()
-    features = network.encode(image, True)
-    answer = network.decode(features, ranges, queries, True)
-    rows = []
-    for q in range(queries.shape[1]):
-        [gradient] = torch.autograd.grad(answer[0, q], ranges, retain_graph=True)  # w_t at the pixel of neighbour t
-        rows.append(gather_neighbours(gradient[:, None], queries[:, q : q + 1])[0][0, 0, :, 0])
-    return answer.detach()[0], torch.stack(rows)
+LOOKS = 0, STEPS // 4, STEPS
+ROWS, COLUMNS = slice(4, 44), slice(615, 765)
 
 
+def draw_answers():
+    """A crop of the held-out scan: the truth, and the answers of each kind on the way."""
+    grid = plt.figure(figsize=(11, 5), layout="constrained").subplots(3, 4)
+    for line, step in zip(grid, LOOKS, strict=True):
+        shown = {"truth": truth.filled()} | {kind: scratch[kind, 0].answers[step] for kind in KINDS}
+        for axis, (name, ranges) in zip(line, shown.items(), strict=True):
+            axis.imshow(ranges[ROWS, COLUMNS].cpu(), cmap="viridis_r", vmin=0, vmax=50, origin="lower", aspect="auto")
+            axis.set(xticks=[], yticks=[], title=name if name == "truth" else f"{name}, step {step}")
+    plt.show()
+
+
+draw_answers()
+
+# %% [markdown]
+# *In words: a piece of a street, 40 rows by 150 columns. The truth, three times the same, has sharp outlines. In the
+# top row, untrained, values and corrections are one colour; weights show the street already, in coarse steps. After 30
+# steps values are stained, corrections show the street with wrong ranges. After 120 steps all three show the street.*
+#
+# ## 7. The same edge
+#
+# Which neighbour does the network trust while a query walks across an edge? The softmax of its scores says it.
+
+# %%
 one, other = scan.ranges[:, :-1], scan.ranges[:, 1:]
 similar = (one.diff(dim=0).abs() < 0.5) & (other.diff(dim=0).abs() < 0.5)
 cell = torch.stack((one[:-1], other[:-1], one[1:], other[1:]))
@@ -396,23 +500,23 @@ edges = [divmod(int(place), jump.shape[1]) for place in jump.flatten().topk(12).
 
 
 def draw_walk(number=0):
-    """Answers of all networks, and the weights of ILN, on a walk across one of the strongest edges."""
+    """Answers of the three networks, and the weights of one, on a walk across one of the strongest edges."""
     row, column = edges[number]
-    parts = torch.linspace(0, 1, 33)[1:-1]
+    parts = torch.linspace(0, 1, 65)[1:-1]
     walk = torch.stack((torch.full_like(parts, row + 0.5), column + parts), -1)[None].to(device)
     left, right = plt.figure(figsize=(10, 3.2), layout="constrained").subplots(1, 2)
-    for (name, network), style in zip(networks.items(), ("-", "--", "-"), strict=True):
-        with torch.no_grad():
-            left.plot(parts, network(image, walk)[0].cpu(), style, color=COLOURS[name], linewidth=2, label=name)
+    with torch.no_grad():
+        for kind, network in networks.items():
+            left.plot(parts, network(image, walk)[0].cpu(), color=COLOURS[kind], linewidth=2, label=kind)
+        scores = networks["weights"].predict(image, walk, True)[0]
     for side, pixels in ((0, image[0, row : row + 2, column]), (1, image[0, row : row + 2, column + 1])):
         left.plot([side, side], pixels.cpu(), "k^", label="measured" if side == 0 else None)
     left.set(xlabel="part of the way", ylabel="range [m]", title=f"edge {number}")
     left.legend(frameon=False, fontsize=8)
-    weights = weights_of(networks["weights (ILN)"], image, walk)[1].cpu()
     names = "left, lower", "right, lower", "left, upper", "right, upper"
     colours = "#0072b2", "#e69f00", "#009e73", "#cc79a7"
-    right.stackplot(parts, weights.T, labels=names, colors=colours, alpha=0.8)
-    right.set(xlabel="part of the way", ylabel="weights of ILN", ylim=(0, 1))
+    right.stackplot(parts, scores.softmax(-1).T.cpu(), labels=names, colors=colours, alpha=0.8)
+    right.set(xlabel="part of the way", ylabel="weights", ylim=(0, 1))
     right.legend(fontsize=8, loc="center")
     plt.show()
 
@@ -420,9 +524,12 @@ def draw_walk(number=0):
 draw_walk()
 
 # %% [markdown]
-# *In words: left, the answers between two columns, one measured at 5.5 m and one at 16.3 m. LIIF and the MLP draw
-# almost straight slopes; ILN's curve comes closer to both levels and is steeper between them. Right, its weights as
-# stacked bands: those of the left neighbours shrink on the way and those of the right ones grow.*
+# *In words: left, the answers between two columns, one measured at 5.5 m and one at 16.3 m. Corrections, which begin
+# with areas, run straight from level to level. Values and weights draw flatter slopes that miss both. Right, the weights
+# as stacked bands: on the way those of the left neighbours shrink a little, and those of the right ones grow.*
+#
+# The weights have only begun to move away from a quarter each. At this edge corrections are better off, because their
+# areas know where the query lies. Over the whole scan weights are ahead all the same.
 #
 # Another edge. In a running notebook a slider shows all of them:
 
@@ -430,45 +537,84 @@ draw_walk()
 slide(draw_walk, number=(0, len(edges) - 1, 1))
 
 # %% [markdown]
-# After so short a training the step is still soft. See what `FAST = False` makes of it. Scores are continuous in the
-# offset, too, so that it will always be a ramp; but softmax saturates. If the difference of two scores runs from -8 to
-# 8 within a tenth of the cell, the answer lies flat on both levels and is steep between them. And the levels are exact,
-# since they are measured. LIIF would have to say both levels *and* the ramp.
-#
-# ## 7. Start from a formula
-#
-# Scores can be added to something that is already right. `gather_blend` adds a prior $p$ to them:
-# $w = \operatorname{softmax}(s + p)$. If the last layer of $h$ starts at zero, the untrained network **is** the formula
-# behind the prior, and training only has to learn where to deviate from it.
-#
-# **Predict:** it starts as the perspective blend of notebook 03, which is right on planes. Will 120 steps of training
-# raise its MAE, its IoU, both?
+# Given time, softmax saturates. If the difference of two scores runs from -8 to 8 within a tenth of the cell, the answer
+# lies flat on both levels and is steep between them. And the levels are exact, since they are measured. Corrections
+# keep the ramp of the areas, unless they learn to take it away. Here are the networks that ship, after thousands of
+# steps, and the truth:
+
 
 # %%
-torch.manual_seed(0)
-perspective = models.create("iln", prior="perspective", blocks=4).to(device)
-with torch.no_grad():
-    off = (perspective(image, queries) - models.create("bilinear-inverse")(image, queries)).abs().mean()
-print(f"untrained, and bilinear over inverse range: {1000 * off:.1f} mm apart in the mean")
-assert off < 1e-2
+def draw_shipped(number=0):
+    """Answers of the shipped networks on the same walk."""
+    row, column = edges[number]
+    parts = torch.linspace(-1, 2, 193)
+    walk = torch.stack((torch.full_like(parts, row + 0.5), column + parts), -1)[None].to(device)
+    axis = plt.figure(figsize=(9, 3.2), layout="constrained").subplots()
+    seen = CLOSE.filled()[2 * row + 1, (16 * (column - 1) + torch.arange(49)) % (16 * 1024)]
+    axis.plot(torch.linspace(-1, 2, 49), seen.cpu(), color="black", linewidth=4, alpha=0.3, label="truth")
+    shown = {"liif": "#d55e00", "iln": "#0072b2", "iln-surfaces": "#009e73"}
+    for (name, colour), style in zip(shown.items(), ("-", "--", "-"), strict=True):
+        with torch.no_grad():
+            line = models.load(name).to(device)(image, walk, True, SENSOR)[0]
+        axis.plot(parts, line.cpu(), style, color=colour, linewidth=2, label=name)
+    axis.set(xlabel="column; 0 is the last before the jump", ylabel="range [m]", title=f"edge {number}")
+    axis.legend(frameon=False)
+    plt.show()
 
-curve = train(perspective, STEPS)
-for name, point in (("untrained", curve[0]), ("trained", curve[STEPS])):
-    print(f"iln with a prior, {name:>9}: MAE {point['mae']:.2f} m, IoU {point['iou']:.3f}")
-assert curve[0]["iou"] > last["weights (ILN)"] or not FAST
-assert curve[STEPS]["mae"] < curve[0]["mae"]
+
+CLOSE = held_out(SENSOR.resize(31, 16 * 1024))[1]  # a row half way between two of ours, 16 columns for each
+draw_shipped()
 
 # %% [markdown]
-# It starts where ILN would be after a long training. Then the MAE falls, and so does the IoU: L1 in metres is won at
-# edges, where errors are large, and pays for it with centimetres on planes, which is what 10 cm cubes count. Our own
-# network, `iln-surfaces`, need not pay: it weighs where the *surfaces* of the neighbours, continued, are met along the
-# query (`kernels.surfaces`). On planes all of them say the same. **The surfaces say where, the network says which.** It
-# stands beside the others in notebook 08.
-
-# %% [markdown]
-# ### Exercise 3 · A prior as scores
+# *In words: the truth jumps from 5.5 m to 16.3 m, and soon after to 18 m. The shipped `liif` climbs over most of a
+# column; `iln` is flat on both levels and steep in between; `iln-surfaces`, which answers with a surface and never with
+# a blend of two, jumps both times. None knows exactly where.*
 #
-# ★★☆ · 10 minutes
+# ## 8. Start from a formula
+#
+# Scores can be added to something that is already right. `gather_blend` adds a prior $p$ to them:
+# $w = \operatorname{softmax}(s + p)$. With $p_t = \log a_t$ and a last layer of $h$ that starts at zero, the untrained
+# network **is** bilinear interpolation. So are corrections whose last layer starts at zero. (Values have no such start.
+# They would have to learn bilinear interpolation first.) Now both have the same start, the same ranges and the same
+# network, and only the question differs.
+#
+# **Predict:** who is ahead now?
+
+
+# %%
+class FromBilinear(Network):
+    """The same network, which starts as bilinear interpolation."""
+
+    def __init__(self, kind):
+        super().__init__(kind)
+        nn.init.zeros_(self.h[-1].weight)
+        nn.init.zeros_(self.h[-1].bias)
+
+    def forward(self, image, queries, wrap=True):
+        if self.kind == "corrections":
+            return super().forward(image, queries, wrap)
+        return gather_blend(image, queries, self.predict(image, queries, wrap), "bilinear", wrap, area_floor=1e-4)
+
+
+_, started = train(FromBilinear, ("corrections", "weights"))
+tell(started)
+iou = {kind: values.mean() for kind, values in ends(started, "iou").items()}
+mae = {kind: values.mean() for kind, values in ends(started, "mae").items()}
+print(f"\nfrom bilinear, weights over corrections: IoU {iou['weights'] / iou['corrections']:.2f}, ", end="")
+print(f"MAE {mae['weights'] / mae['corrections']:.2f}")
+draw_curves(started, 2.0)
+assert iou["weights"] > iou["corrections"]
+
+# %% [markdown]
+# *In words: both start on the dotted line of bilinear interpolation. Weights rise above it in IoU and fall below it in
+# MAE; corrections first leave it for the worse.*
+#
+# From the same start, weights are ahead as well. A correction moves in metres and must be kept near zero on every wall;
+# a weight cannot hurt there.
+#
+# ### Exercise 4 · A prior as scores
+#
+# importance ★★☆ · difficulty ★★☆ · 10 minutes
 #
 # Write `prior_scores(r, a)`: the scores (Q, 4) whose softmax blends 1/r bilinearly, from ranges r and areas a (Q, 4).
 # An area of 0 (a query on the centre of a pixel) would give a score of minus infinity, which no network could overrule:
@@ -521,14 +667,21 @@ def prior_scores(r, a):
 
 
 # %% [markdown]
+# With this prior a network starts as the perspective blend of notebook 03, which is right on planes. Then the MAE falls,
+# and so does the IoU: L1 in metres is won at edges, and pays for it with centimetres on planes. Our own network,
+# `iln-surfaces`, need not pay. It weighs where the *surfaces* of the neighbours, continued, are met along the query, and
+# on planes all of them say the same. **The surfaces say where, the network says which.** [Notebook
+# 10](10_surfaces.ipynb) builds it.
+#
 # ## Summary
 #
-# 1. Predicting weights, the network chooses among measurements; predicting values, it makes up ranges.
+# 1. Predicting weights, the network chooses among measurements; predicting values, it makes up ranges; corrections are
+#    in between.
 # 2. A softmax blend never leaves the span of its neighbours, so that places where they agree are right before any
 #    training.
 # 3. The gradient of a score is $w_t (r_t - \hat r)$: learning is spent where neighbours differ.
-# 4. With equal encoder, rays and steps, weights are far ahead of values in IoU early on. A network that starts from a
-#    formula starts further still.
+# 4. With equal encoder, rays and steps, weights are ahead of corrections and corrections of values in IoU early on.
+#    Started from bilinear interpolation, weights are ahead of corrections too.
 #
 # ## Next
 #
