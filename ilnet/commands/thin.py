@@ -149,5 +149,5 @@ def _draw(study: Study, rows: list[dict[str, Any]]) -> None:
     labels = [f"{case}\n({row['in_sight']})" for case, row in zip(cases, rows, strict=True)]
     axis.set_xticks(range(len(rows)), labels, fontsize=8)
     axis.set_ylabel("share with 10 points")
-    axis.legend(fontsize=8)
+    axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
     figure.savefig(study.out / "thin.png", dpi=120)
