@@ -114,7 +114,7 @@ def edges(truth: Scan) -> torch.Tensor:
     """Returns which pixels are near a range edge.
 
     Take two pixels i, j next to each other in a row or a column, with true ranges t_i, t_j (no return is `norm_range`)
-    and points p_i, p_j. They *part* where |t_i - t_j| > 2 m and |p_i × p_j| / |p_i - p_j| < D, with m = 0.3 m and
+    and points p_i, p_j. They *part* where `|t_i - t_j| > 2 m` and `|p_i × p_j| / |p_i - p_j| < D`, with m = 0.3 m and
     D = 1 m. The first says that the gap has room for a point on neither side. The second says that the straight line
     through both points passes the sensor closer than D, so that no visible surface holds both. Ground at a grazing
     angle has large gaps too, but its lines pass the sensor as far away as the ground itself. A pixel is at an edge

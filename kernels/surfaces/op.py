@@ -387,7 +387,7 @@ def surface_likelihood(
 
     Returns:
         likelihood: (..., Q), -log p of Eq. (4).
-        error: (..., Q) metres, the expected absolute error Σ_tk w_tk |r_tk - r|.
+        error: (..., Q) metres, the expected absolute error `Σ_tk w_tk |r_tk - r|`.
 
     Raises:
         TypeError: If an argument is not a floating-point tensor of a supported dtype.
