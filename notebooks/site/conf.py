@@ -85,7 +85,7 @@ def draw_inline(self: Any, node: Any) -> None:
 
 
 def draw_block(self: Any, node: Any) -> None:
-    self.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
+    self.body.append(f'<div class="formula">{convert(node.astext(), display="block")}</div>')
     raise nodes.SkipNode
 
 
