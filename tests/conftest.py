@@ -6,10 +6,12 @@ from pathlib import Path
 import pytest
 import torch
 
-# Each of the processes that run tests, and what they start, gets its share of the cores.
-THREADS = max(1, (os.cpu_count() or 1) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)))
-os.environ.setdefault("OMP_NUM_THREADS", str(THREADS))
-torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+# Each of the processes that run tests, and what they start, gets its share of the cores. More threads than cores would
+# wait for one another.
+if workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 0)):
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    os.environ["OMP_NUM_THREADS"] = str(threads)
+    torch.set_num_threads(threads)
 
 # Measurements that serve the tests but do not travel with the project.
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
