@@ -198,7 +198,7 @@ BAD = {
         "sensor is 'vlp-61'; it should be one of",
     ),
     "unwritable folder": (["demo", "--scan", "good.npz", "--rows", "4", "--out", "text.ply"], "text.ply"),
-    "no scene": (["evaluate", "--model", "iln"], "--scene TOWN|MESH, --data DIR or --protocol kitti FILE"),
+    "no scene": (["evaluate", "--model", "iln"], "--scene TOWN|MESH, --scan FILE, --data DIR or --protocol kitti FILE"),
     "no such scene": ([*SCENE, "town99"], "town99 is neither a town (town01"),
     "mesh without positions": ([*SCENE, "yard.ply"], "needs --at FILE"),
     "town with positions": ([*SCENE, "town01", "--at", "at.json"], "--at goes with a mesh"),
